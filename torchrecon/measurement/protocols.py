@@ -1,0 +1,35 @@
+"""The callables that stages hand to one another."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+
+from torchrecon._typing import Int, Tensor
+from torchrecon.measurement.filled import FilledTracks
+from torchrecon.measurement.rank_estimate import RankEstimate
+from torchrecon.measurement.reconstruction import Reconstruction
+from torchrecon.measurement.tracks import Tracks
+
+__all__ = ["GapFiller", "RankRule", "Solver"]
+
+
+class Solver(Protocol):
+    """From tracks and a number of shape bases to 3D: every file in ``torchrecon.nrsfm`` offers one."""
+
+    def __call__(
+        self, tracks: Tracks, rank: int | Int[Tensor, "*batch"], *, generator: torch.Generator | None = None
+    ) -> Reconstruction: ...
+
+
+class RankRule(Protocol):
+    """From tracks to the number of shape bases: every file in ``torchrecon.rank`` offers one."""
+
+    def __call__(self, tracks: Tracks) -> RankEstimate: ...
+
+
+class GapFiller(Protocol):
+    """From tracks with gaps to a value and a covariance for every entry: every file in ``torchrecon.gaps``."""
+
+    def __call__(self, tracks: Tracks) -> FilledTracks: ...
