@@ -1,0 +1,30 @@
+"""The command line ``torchrecon``; nothing heavy is loaded before a command runs."""
+
+from __future__ import annotations
+
+import sys
+
+from torchrecon.cli.parser import build_parser
+from torchrecon.errors import ReconError
+
+__all__ = ["main"]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command.
+
+    Returns:
+        0 when done, 2 for unusable input (one sentence on stderr), 130 when interrupted.
+    """
+    options = build_parser().parse_args(arguments)
+    from torchrecon.cli import commands
+
+    try:
+        commands.run(options)
+    except ReconError as error:
+        print(f"torchrecon {options.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"torchrecon {options.command}: interrupted", file=sys.stderr)
+        return 130
+    return 0

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import tempfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -14,20 +15,17 @@ import torch
 from torchrecon.errors import ReconError
 
 
-def write_npz(path: str | os.PathLike[str], arrays: dict[str, Any]) -> Path:
-    """Write named arrays to ``path`` so that the final name never holds half a file."""
+def write_atomic(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> Path:
+    """Let ``write`` fill a temporary file and move it to ``path``: the final name never holds half a file."""
     target = Path(path)
     if not target.parent.is_dir():
         raise ReconError(f"{target}: the folder {target.parent} does not exist; create it first")
-    plain = {
-        name: value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
-        for name, value in arrays.items()
-        if value is not None
-    }
+    if target.is_dir():
+        raise ReconError(f"{target}: is a folder; name a file")
     descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
     try:
         with os.fdopen(descriptor, "wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **plain)
+            write(stream)
             stream.flush()
             os.fsync(stream.fileno())
         mask = os.umask(0)
@@ -38,6 +36,16 @@ def write_npz(path: str | os.PathLike[str], arrays: dict[str, Any]) -> Path:
         Path(temporary).unlink(missing_ok=True)
         raise
     return target
+
+
+def write_npz(path: str | os.PathLike[str], arrays: dict[str, Any]) -> Path:
+    """Write the named arrays that are not None, atomically and without pickle."""
+    plain = {
+        name: value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+        for name, value in arrays.items()
+        if value is not None
+    }
+    return write_atomic(path, lambda stream: np.savez_compressed(stream, allow_pickle=False, **plain))
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:

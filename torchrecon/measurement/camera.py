@@ -25,7 +25,7 @@ def project_points(points3d: Float[Tensor, "*b 3"], intrinsics: Float[Tensor, "*
 def normalised_coordinates(xy: Float[Tensor, "*b 2"], intrinsics: Float[Tensor, "*k 3 3"]) -> Float[Tensor, "*b 2"]:
     """Pixels to the image plane at distance 1: the first two entries of ``K^-1 [u, v, 1]^T``."""
     homogeneous = torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
-    ray: Tensor = torch.linalg.solve(intrinsics, homogeneous[..., None])[..., 0]
+    ray: Tensor = (torch.linalg.inv(intrinsics) @ homogeneous[..., None])[..., 0]
     return ray[..., :2] / ray[..., 2:]
 
 

@@ -142,15 +142,13 @@ class Reconstruction:
         root = frames**0.5
         weights = u[..., :available] * s[..., None, :available] * keep[..., None, :] / root
         basis = (vh[..., :available, :] * keep[..., None] * root).unflatten(-1, (points3d.shape[-2], 3))
-        weights = weights * 1.0
         sign = torch.where(weights.sum(-2, keepdim=True) < 0, -1.0, 1.0).to(weights.dtype)
         weights, basis = weights * sign, basis * sign.transpose(-1, -2)[..., None]
         if available < largest:
             weights = torch.nn.functional.pad(weights, (0, largest - available))
             basis = torch.nn.functional.pad(basis, (0, 0, 0, 0, 0, largest - available))
         degree = rank if deformation_degree is None else deformation_degree
-        if not isinstance(degree, torch.Tensor):
-            degree = float(degree)
+        degree = degree.to(points3d.dtype) if isinstance(degree, Tensor) else float(degree)
         return cls(
             points3d=points3d,
             rotations=rotations,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from torchrecon.errors import ReconError
 from torchrecon.measurement._store import read_npz, write_npz
 
 __all__ = ["Tracks"]
+
+# What torch.as_tensor takes; the container turns it into a tensor once, here.
+ArrayLike: TypeAlias = Any
 
 _TENSORS = ("covariance", "depth", "depth_variance", "intrinsics", "times")
 
@@ -37,7 +41,38 @@ def _first(mask: Tensor) -> str:
     return str(tuple(int(i) for i in mask.nonzero()[0]))
 
 
-@dataclass(frozen=True, eq=False)
+def _visible(visible: Any, xy: Tensor) -> Tensor:
+    finite = torch.isfinite(xy).all(-1)
+    if visible is None:
+        seen = finite
+    else:
+        try:
+            seen = torch.as_tensor(visible).to(device=xy.device).bool()
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ReconError(f"visible: cannot be read as a boolean array ({error})") from error
+        if seen.shape != finite.shape:
+            raise ReconError(f"visible: shape {tuple(seen.shape)} does not fit xy; {tuple(finite.shape)} is needed")
+        wrong = seen & ~finite
+        if wrong.any():
+            raise ReconError(
+                f"xy: entry {_first(wrong)} is marked visible but is not finite; mark it invisible or give its position"
+            )
+    if not seen.any():
+        raise ReconError("visible: no point is seen in any frame; at least one observation is needed")
+    return seen
+
+
+def _rate(fps: Any) -> float:
+    try:
+        rate = float(fps)
+    except (TypeError, ValueError) as error:
+        raise ReconError(f"fps: {fps!r} is not a number of frames per second") from error
+    if not 0 < rate < float("inf"):
+        raise ReconError(f"fps: {fps!r} is not a positive number of frames per second")
+    return rate
+
+
+@dataclass(frozen=True, eq=False, init=False)
 class Tracks:
     """Points followed through the frames of one sequence, or of a batch of sequences.
 
@@ -71,55 +106,60 @@ class Tracks:
     """
 
     xy: Float[Tensor, "*batch frames points 2"]
-    visible: Bool[Tensor, "*batch frames points"] = None  # type: ignore[assignment]
-    covariance: Float[Tensor, "*batch frames points 2 2"] | None = None
-    depth: Float[Tensor, "*batch frames points"] | None = None
-    depth_variance: Float[Tensor, "*batch frames points"] | None = None
-    intrinsics: Float[Tensor, "*batch 3 3"] | None = None
-    fps: float = 25.0
-    times: Float[Tensor, "*batch frames"] = None  # type: ignore[assignment]
-    names: tuple[str, ...] | None = None
-    edges: tuple[tuple[int, int], ...] | None = None
-    extras: Mapping[str, Tensor] | None = None
+    visible: Bool[Tensor, "*batch frames points"]
+    covariance: Float[Tensor, "*batch frames points 2 2"] | None
+    depth: Float[Tensor, "*batch frames points"] | None
+    depth_variance: Float[Tensor, "*batch frames points"] | None
+    intrinsics: Float[Tensor, "*batch 3 3"] | None
+    fps: float
+    times: Float[Tensor, "*batch frames"]
+    names: tuple[str, ...] | None
+    edges: tuple[tuple[int, int], ...] | None
+    extras: Mapping[str, Tensor] | None
 
-    def __post_init__(self) -> None:
-        given = torch.as_tensor(self.xy).device if isinstance(self.xy, torch.Tensor) else None
-        xy = _tensor("xy", self.xy, None, given)
-        if xy.ndim < 3 or xy.shape[-1] != 2:
-            raise ReconError(f"xy: shape {tuple(xy.shape)}; (*batch, frames, points, 2) is needed")
-        if xy.shape[-3] < 1 or xy.shape[-2] < 1:
-            raise ReconError(f"xy: shape {tuple(xy.shape)} has no frame or no point")
-        dtype, device, shape = xy.dtype, xy.device, tuple(xy.shape[:-1])
-        finite = torch.isfinite(xy).all(-1)
-        if self.visible is None:
-            visible = finite
-        else:
-            visible = torch.as_tensor(self.visible).to(device=device)
-            if tuple(visible.shape) != shape:
-                raise ReconError(f"visible: shape {tuple(visible.shape)} does not fit xy; {shape} is needed")
-            visible = visible.bool()
-            wrong = visible & ~finite
-            if wrong.any():
-                raise ReconError(
-                    f"xy: entry {_first(wrong)} is marked visible but is not finite; "
-                    "mark it invisible or give its position"
-                )
-        if not visible.any():
-            raise ReconError("visible: no point is seen in any frame; at least one observation is needed")
-        if self.extras is not None and "xy" in self.extras:
+    def __init__(
+        self,
+        xy: ArrayLike,
+        visible: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+        depth: ArrayLike | None = None,
+        depth_variance: ArrayLike | None = None,
+        intrinsics: ArrayLike | None = None,
+        fps: float = 25.0,
+        times: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+        edges: Sequence[Sequence[int]] | None = None,
+        extras: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        put = functools.partial(object.__setattr__, self)
+        positions = _tensor("xy", xy, None, None)
+        if positions.ndim < 3 or positions.shape[-1] != 2:
+            raise ReconError(f"xy: shape {tuple(positions.shape)}; (*batch, frames, points, 2) is needed")
+        if positions.shape[-3] < 1 or positions.shape[-2] < 1:
+            raise ReconError(f"xy: shape {tuple(positions.shape)} has no frame or no point")
+        if extras is not None and "xy" in extras:
             raise ReconError("extras: the name 'xy' is taken by the tracks themselves")
-        put = object.__setattr__
+        shape = tuple(positions.shape[:-1])
+        seen = _visible(visible, positions)
         # An unseen entry is replaced, not multiplied by zero: NaN times zero is NaN, also in gradients.
-        put(self, "xy", torch.where(visible[..., None], xy, xy.new_tensor(float("nan"))))
-        put(self, "visible", visible)
-        for name in _TENSORS:
-            value = getattr(self, name)
-            if value is not None:
-                put(self, name, _tensor(name, value, dtype, device))
+        put("xy", torch.where(seen[..., None], positions, positions.new_tensor(float("nan"))))
+        put("visible", seen)
+        put("covariance", self._optional("covariance", covariance))
+        put("depth", self._optional("depth", depth))
+        put("depth_variance", self._optional("depth_variance", depth_variance))
+        put("intrinsics", self._optional("intrinsics", intrinsics))
+        put("extras", extras)
         self._check_noise(shape)
-        self._check_camera_and_depth(shape)
-        self._check_times(shape)
+        self._check_camera(shape)
+        self._check_depth(shape)
+        put("fps", _rate(fps))
+        put("times", self._times(self._optional("times", times), shape))
+        put("names", None if names is None else tuple(str(name) for name in names))
+        put("edges", None if edges is None else tuple((int(a), int(b)) for a, b in edges))
         self._check_names(shape[-1])
+
+    def _optional(self, name: str, value: Any) -> Tensor | None:
+        return None if value is None else _tensor(name, value, self.xy.dtype, self.xy.device)
 
     def _check_noise(self, shape: tuple[int, ...]) -> None:
         if self.covariance is None:
@@ -138,64 +178,56 @@ class Tracks:
                 f"covariance: entry {_first(wrong)} is not a symmetric positive definite 2x2 matrix in px^2"
             )
 
-    def _check_camera_and_depth(self, shape: tuple[int, ...]) -> None:
-        put = object.__setattr__
-        if self.intrinsics is not None:
-            if self.intrinsics.shape[-2:] != (3, 3):
-                raise ReconError(f"intrinsics: shape {tuple(self.intrinsics.shape)}; (*batch, 3, 3) is needed")
-            try:
-                full = self.intrinsics.expand(*shape[:-2], 3, 3)
-            except RuntimeError as error:
-                raise ReconError(
-                    f"intrinsics: shape {tuple(self.intrinsics.shape)} does not fit the batch {shape[:-2]} of xy"
-                ) from error
-            if not torch.isfinite(full).all() or not (full[..., 0, 0] * full[..., 1, 1] > 0).all():
-                raise ReconError("intrinsics: focal lengths K[0,0] and K[1,1] must be finite and of one sign")
-            put(self, "intrinsics", full)
-        if self.depth is not None:
-            if self.intrinsics is None:
-                raise ReconError("depth: needs intrinsics, a (3, 3) pinhole matrix; give it or leave depth out")
-            if tuple(self.depth.shape) != shape:
-                raise ReconError(f"depth: shape {tuple(self.depth.shape)} does not fit xy; {shape} is needed")
-            wrong = self.visible & (self.depth <= 0)
-            if wrong.any():
-                raise ReconError(f"depth: entry {_first(wrong)} is not positive; write NaN where there is no depth")
-        if self.depth_variance is not None:
-            if self.depth is None:
-                raise ReconError("depth_variance: is given without depth")
-            if tuple(self.depth_variance.shape) != shape:
-                raise ReconError(f"depth_variance: shape {tuple(self.depth_variance.shape)}; {shape} is needed")
-            wrong = self.visible & torch.isfinite(self.depth) & ~(self.depth_variance > 0)
-            if wrong.any():
-                raise ReconError(f"depth_variance: entry {_first(wrong)} is not positive (m^2)")
+    def _check_camera(self, shape: tuple[int, ...]) -> None:
+        if self.intrinsics is None:
+            return
+        if self.intrinsics.shape[-2:] != (3, 3):
+            raise ReconError(f"intrinsics: shape {tuple(self.intrinsics.shape)}; (*batch, 3, 3) is needed")
+        try:
+            full = self.intrinsics.expand(*shape[:-2], 3, 3)
+        except RuntimeError as error:
+            raise ReconError(
+                f"intrinsics: shape {tuple(self.intrinsics.shape)} does not fit the batch {shape[:-2]} of xy"
+            ) from error
+        if not torch.isfinite(full).all() or not (full[..., 0, 0] * full[..., 1, 1] > 0).all():
+            raise ReconError("intrinsics: focal lengths K[0,0] and K[1,1] must be finite and of one sign")
+        object.__setattr__(self, "intrinsics", full)
 
-    def _check_times(self, shape: tuple[int, ...]) -> None:
-        put = object.__setattr__
-        if not (isinstance(self.fps, (int, float, np.number)) and 0 < float(self.fps) < float("inf")):
-            raise ReconError(f"fps: {self.fps!r} is not a positive number of frames per second")
-        put(self, "fps", float(self.fps))
-        if self.times is None:
+    def _check_depth(self, shape: tuple[int, ...]) -> None:
+        if self.depth is None:
+            if self.depth_variance is not None:
+                raise ReconError("depth_variance: is given without depth")
+            return
+        if self.intrinsics is None:
+            raise ReconError("depth: needs intrinsics, a (3, 3) pinhole matrix; give it or leave depth out")
+        if tuple(self.depth.shape) != shape:
+            raise ReconError(f"depth: shape {tuple(self.depth.shape)} does not fit xy; {shape} is needed")
+        wrong = self.visible & (self.depth <= 0)
+        if wrong.any():
+            raise ReconError(f"depth: entry {_first(wrong)} is not positive; write NaN where there is no depth")
+        if self.depth_variance is None:
+            return
+        if tuple(self.depth_variance.shape) != shape:
+            raise ReconError(f"depth_variance: shape {tuple(self.depth_variance.shape)}; {shape} is needed")
+        wrong = self.visible & torch.isfinite(self.depth) & ~(self.depth_variance > 0)
+        if wrong.any():
+            raise ReconError(f"depth_variance: entry {_first(wrong)} is not positive (m^2)")
+
+    def _times(self, times: Tensor | None, shape: tuple[int, ...]) -> Tensor:
+        if times is None:
             times = torch.arange(shape[-2], dtype=self.xy.dtype, device=self.xy.device) / self.fps
-        else:
-            times = self.times
-            if times.shape[-1:] != (shape[-2],):
-                raise ReconError(f"times: {tuple(times.shape)} does not fit {shape[-2]} frames")
-            if not torch.isfinite(times).all() or (shape[-2] > 1 and not (times.diff(dim=-1) > 0).all()):
-                raise ReconError("times: must be finite and increase from frame to frame (seconds)")
-        put(self, "times", times.expand(*shape[:-2], shape[-2]))
+        elif times.shape[-1:] != (shape[-2],):
+            raise ReconError(f"times: shape {tuple(times.shape)} does not fit {shape[-2]} frames")
+        elif not torch.isfinite(times).all() or (shape[-2] > 1 and not (times.diff(dim=-1) > 0).all()):
+            raise ReconError("times: must be finite and increase from frame to frame (seconds)")
+        return times.expand(*shape[:-2], shape[-2])
 
     def _check_names(self, points: int) -> None:
-        put = object.__setattr__
-        if self.names is not None:
-            if len(self.names) != points:
-                raise ReconError(f"names: {len(self.names)} names for {points} points")
-            put(self, "names", tuple(str(name) for name in self.names))
-        if self.edges is not None:
-            edges = tuple((int(a), int(b)) for a, b in self.edges)
-            for edge in edges:
-                if not all(0 <= end < points for end in edge):
-                    raise ReconError(f"edges: {edge} names a point outside 0..{points - 1}")
-            put(self, "edges", edges)
+        if self.names is not None and len(self.names) != points:
+            raise ReconError(f"names: {len(self.names)} names for {points} points")
+        for edge in self.edges or ():
+            if not all(0 <= end < points for end in edge):
+                raise ReconError(f"edges: {edge} names a point outside 0..{points - 1}")
 
     @property
     def batch_shape(self) -> torch.Size:
