@@ -20,7 +20,7 @@ def rec() -> tr.Reconstruction:
 
 
 def test_csv(rec, tmp_path):
-    with export_reconstruction(rec, tmp_path / "a.csv", fps=50).open() as stream:
+    with export_reconstruction(rec, tmp_path / "a.csv", fps=50.0).open() as stream:
         rows = list(csv.DictReader(stream))
     values = np.array([[float(r[a]) for a in "xyz"] for r in rows]).reshape(4, 5, 3)
     np.testing.assert_allclose(values, rec.points3d, atol=1e-8)
@@ -28,7 +28,7 @@ def test_csv(rec, tmp_path):
 
 
 def test_trc_is_y_up_and_tab_separated(rec, tmp_path):
-    lines = export_reconstruction(rec, tmp_path / "a.trc", fps=50).read_text().splitlines()
+    lines = export_reconstruction(rec, tmp_path / "a.trc", fps=50.0).read_text().splitlines()
     assert lines[2].split("\t")[2:5] == ["4", "5", "m"]
     values = np.array([[float(x) for x in line.split("\t")[2:]] for line in lines[6:]]).reshape(4, 5, 3)
     np.testing.assert_allclose(values * [1, -1, -1], rec.points3d, atol=1e-8)
@@ -45,7 +45,7 @@ def test_ply(rec, tmp_path):
 def test_c3d(rec, tmp_path):
     import ezc3d
 
-    read = ezc3d.c3d(str(export_reconstruction(rec, tmp_path / "a.c3d", fps=50)))
+    read = ezc3d.c3d(str(export_reconstruction(rec, tmp_path / "a.c3d", fps=50.0)))
     np.testing.assert_allclose(read["data"]["points"][:3].transpose(2, 1, 0), rec.points3d, atol=1e-5)
     assert read["parameters"]["POINT"]["RATE"]["value"] == [50]
 
