@@ -42,9 +42,9 @@ def bilateral_depth(
     The paper prints the numerator of (13) with the value at the centre pixel, which makes the filter the identity;
     here it is the value of the neighbour, and ``*`` in (14) is a product:
     ``g(p) = sum_q f(q) w(p, q) / sum_q w(p, q)`` with
-    ``w(p, q) = exp(-|p - q|^2 / (2 s_space^2)) exp(-(f(p) - f(q))^2 / (2 s_range^2))``, q over the valid pixels of a square window. On a full mask it is ``kornia.filters.bilateral_blur`` (reflected
-    border). It never fills a hole: pixels that are not valid come out as NaN. Filter the depth map first, then
-    back-project.
+    ``w(p, q) = exp(-|p - q|^2 / (2 s_space^2)) exp(-(f(p) - f(q))^2 / (2 s_range^2))``, q over the valid pixels of a
+    square window. On a full mask it is ``kornia.filters.bilateral_blur`` (reflected border). It never fills a hole:
+    pixels that are not valid come out as NaN. Filter the depth map first, then back-project.
 
     Args:
         depth: metres; values of invalid pixels are never read.
