@@ -1,0 +1,190 @@
+"""One step of the tracker: living points are predicted, matched and updated from one frame to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from torchrecon._typing import Float, Tensor
+from torchrecon.features.align import Templates, align_affine, align_translation, make_templates
+from torchrecon.features.region import Region
+from torchrecon.statespace import abg_gains, abg_predict, abg_update
+
+if TYPE_CHECKING:
+    from torchrecon.features.tracking import TrackerParams
+
+__all__ = ["Alive", "advance", "born", "match_covariance"]
+
+
+@dataclass(frozen=True, eq=False)
+class Alive:
+    """The living tracks, one row each.
+
+    Attributes:
+        ids: (n,) number of the track.
+        xy: (n, 2) pixels of the image.
+        state: (n, 2, 3) alpha-beta-gamma state of x and y, per frame.
+        affine: (n, 2, 2) deformation from the template to the last frame.
+        templates: what the point looked like when its template was taken.
+        anchor: (n, 2, 2) px^2, covariance of the position at which the template was taken.
+        covariance: (n, 2, 2) px^2 of ``xy`` against the point first seen.
+        age: (n,) frames since birth.
+        score: (n,) correlation of the last match.
+    """
+
+    ids: Tensor
+    xy: Tensor
+    state: Tensor
+    affine: Tensor
+    templates: Templates
+    anchor: Tensor
+    covariance: Tensor
+    age: Tensor
+    score: Tensor
+
+    def select(self, keep: Tensor) -> Alive:
+        """The tracks at an index or boolean mask."""
+        rows = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != "templates"}
+        return Alive(templates=self.templates.select(keep), **rows)
+
+    def join(self, other: Alive) -> Alive:
+        """Both sets of tracks."""
+        mine = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "templates"}
+        both = {name: torch.cat([value, getattr(other, name)]) for name, value in mine.items()}
+        return Alive(templates=Templates.join(self.templates, other.templates), **both)
+
+
+def _identity(count: int, like: Tensor) -> Tensor:
+    return torch.eye(2, dtype=like.dtype, device=like.device).expand(count, 2, 2)
+
+
+def _fine_weights(region: Region, xy: Tensor, half: int) -> Tensor | None:
+    weights = region.weights(xy, half)
+    return None if weights is None else weights[0]
+
+
+def born(region: Region, xy: Float[Tensor, "points 2"], first_id: int, half: int, alive: Alive | None) -> Alive:
+    """New tracks at ``xy`` (pixels of the image), moving at first as their living neighbours do."""
+    count = len(xy)
+    velocity = torch.zeros_like(xy)
+    if alive is not None and len(alive.ids) > 0:
+        nearest = torch.cdist(xy, alive.xy).topk(min(5, len(alive.ids)), largest=False).indices
+        velocity = alive.state[:, :, 1][nearest].median(1).values
+    here = xy - region.origin
+    return Alive(
+        ids=torch.arange(first_id, first_id + count, device=xy.device),
+        xy=xy,
+        state=torch.stack([xy, velocity, torch.zeros_like(xy)], -1),
+        affine=_identity(count, xy).clone(),
+        templates=make_templates(region.pyramid[0], here, half, _fine_weights(region, here, half)),
+        anchor=torch.zeros(count, 2, 2).to(xy),
+        covariance=torch.full((count, 2, 2), torch.nan).to(xy),
+        age=torch.zeros(count, dtype=torch.long, device=xy.device),
+        score=torch.ones(count).to(xy),
+    )
+
+
+def match_covariance(
+    templates: Templates, residual: Float[Tensor, "points samples"], half: int
+) -> Float[Tensor, "points 2 2"]:
+    """Covariance of a matched position: ``2 s_n^2 J^-1 J2 J^-1``, J the structure tensor of the template.
+
+    The noise level comes from the median absolute deviation of the residual. Residuals of neighbouring pixels are
+    correlated (the image is smoothed and interpolated, misfits of the warp are smooth), so the number of independent
+    samples is lowered by the measured lag-1 correlation along both axes. Eigenvalues are kept in
+    [0.05^2, half^2] px^2; the upper one means "not localised along this direction" (aperture).
+
+    Args:
+        templates: the matched windows.
+        residual: in standard deviations of the template.
+        half: half width of the window, pixels.
+    """
+    side = 2 * half + 1
+    used = templates.weights > 0.05 * templates.weights.amax(-1, keepdim=True)
+    absolute = torch.where(used, residual.abs(), torch.nan)
+    noise = 1.4826 * absolute.nanmedian(-1).values * templates.deviation  # of the difference: sqrt(2) s_n
+    image = (residual * templates.weights.sqrt()).reshape(-1, side, side)
+    power = image.square().mean((-1, -2)).clamp_min(1e-12)
+    lag_x = (image[:, :, 1:] * image[:, :, :-1]).mean((-1, -2)) / power
+    lag_y = (image[:, 1:, :] * image[:, :-1, :]).mean((-1, -2)) / power
+    correlation = torch.stack([lag_x, lag_y], -1).clamp(0.0, 0.9)
+    fewer = ((1 + correlation) / (1 - correlation)).prod(-1)
+    trace = templates.structure.diagonal(dim1=-2, dim2=-1).sum(-1)
+    ridge = (1e-4 * trace).clamp_min(1e-12)[:, None, None] * _identity(len(residual), residual)
+    inverse = torch.linalg.inv(templates.structure + ridge)
+    covariance = (noise**2 * fewer)[:, None, None] * (inverse @ templates.structure2 @ inverse)
+    values, vectors = torch.linalg.eigh((covariance + covariance.mT) / 2)
+    clamped: Tensor = vectors @ torch.diag_embed(values.clamp(0.05**2, float(half) ** 2)) @ vectors.mT
+    return clamped
+
+
+def _stretch(affine: Tensor) -> Tensor:
+    """Largest factor by which an affine map stretches or shrinks a direction."""
+    half_power = affine.square().sum((-1, -2)) / 2
+    determinant = (affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]).abs().clamp_min(1e-6)
+    larger = torch.sqrt(half_power + torch.sqrt((half_power**2 - determinant**2).clamp_min(0)))
+    return torch.maximum(larger, larger / determinant)
+
+
+def _neighbour_median(xy: Tensor, values: Tensor, count: int) -> Tensor:
+    """Median of ``values`` (n, 2) over the nearest other points; the values themselves where there is none."""
+    if len(xy) <= count:
+        return values
+    distance = torch.cdist(xy, xy).fill_diagonal_(torch.inf)
+    median: Tensor = values[distance.topk(count, largest=False).indices].median(1).values
+    return median
+
+
+def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> Alive:
+    """Carry living tracks from the last frame into this one; tracks that fail a check are left out.
+
+    Match: translation from the last frame (coarse to fine, from the prediction), then affine against the track's
+    own template, which does not drift. Where the template no longer fits but the last frame does, the template is
+    taken anew from the last frame and the error of the position there stays with the track (``anchor``).
+    """
+    half = params.window
+    predicted = abg_predict(alive.state, 1.0)
+    start, guess = alive.xy - last.origin, predicted[..., 0] - now.origin
+    moved, step_score = align_translation(
+        last.pyramid, now.pyramid, start, guess, half, params.iterations, last.weights(start, half)
+    )
+    back, _ = align_translation(
+        now.pyramid, last.pyramid, moved, moved + start - guess, half, params.iterations, now.weights(moved, half)
+    )
+    image = now.pyramid[0]
+    xy, affine, score, residual = align_affine(alive.templates, image, moved, alive.affine, half, params.iterations)
+
+    def fits(position: Tensor, deform: Tensor, correlation: Tensor, least: float) -> Tensor:
+        near = (position - moved).norm(dim=-1) < params.max_disagreement
+        return (correlation > least) & near & (_stretch(deform) < params.max_stretch)
+
+    stale = ~fits(xy, affine, score, params.renew_correlation)
+    templates, anchor = alive.templates, alive.anchor
+    if stale.any():
+        here = start[stale]
+        fresh = make_templates(last.pyramid[0], here, half, _fine_weights(last, here, half))
+        renewed = align_affine(fresh, image, moved[stale], _identity(len(here), xy), half, params.iterations)
+        templates = templates.replace_where(stale, fresh)
+        xy, affine, score, residual, anchor = (v.clone() for v in (xy, affine, score, residual, anchor))
+        xy[stale], affine[stale], score[stale], residual[stale] = renewed
+        anchor[stale] = torch.nan_to_num(alive.covariance[stale])
+    covariance = anchor + match_covariance(templates, residual, half)
+
+    surprise = xy - guess
+    odd = (surprise - _neighbour_median(guess, surprise, 8)).norm(dim=-1)
+    good = fits(xy, affine, score, params.min_correlation) & (step_score > params.min_correlation)
+    good &= ((back - start).norm(dim=-1) < params.max_backward) & (odd < params.max_neighbour) & now.admits(xy)
+    good &= torch.linalg.eigvalsh(covariance)[:, -1] < params.max_std**2
+
+    found = xy + now.origin
+    state = abg_update(predicted, found, abg_gains(params.alpha), 1.0)
+    # A point seen twice has a velocity; the filter starts from it instead of from a blend with a guess.
+    begin = torch.stack([found, found - alive.xy, torch.zeros_like(found)], -1)
+    state = torch.where((alive.age == 0)[:, None, None], begin, state)
+    new = replace(
+        alive, xy=found, state=state, affine=affine, templates=templates, anchor=anchor, covariance=covariance,
+        age=alive.age + 1, score=score,
+    )  # fmt: skip
+    return new.select(good)

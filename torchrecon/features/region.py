@@ -1,0 +1,144 @@
+"""The part of a frame that a tracker looks at: the object's box, its mask, where points may be born and live."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+
+from torchrecon._typing import Bool, Float, Tensor
+from torchrecon.features.patches import image_pyramid, patch_grid, sample_image, to_gray
+
+__all__ = ["Region", "cut_region", "depth_edges", "erode"]
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """One frame cut to the object and a margin.
+
+    Attributes:
+        gray: (h, w) grey values of the cut.
+        pyramid: of ``gray``, level 0 lightly smoothed.
+        inside: per level 1.0 on the object; None means everywhere.
+        births: (h, w) where points may be born.
+        allowed: (h, w) where points may live.
+        origin: (2,) x, y of the cut's first pixel in the image.
+    """
+
+    gray: Tensor
+    pyramid: list[Tensor]
+    inside: list[Tensor] | None
+    births: Tensor
+    allowed: Tensor
+    origin: Tensor
+
+    def admits(self, xy: Float[Tensor, "points 2"]) -> Bool[Tensor, " points"]:
+        """Whether the nearest pixel lies in the cut and points may live there; ``xy`` in the cut."""
+        nearest = torch.nan_to_num(xy, nan=-1.0).round().long()
+        height, width = self.allowed.shape
+        x, y = nearest.unbind(-1)
+        known = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        return known & self.allowed[y.clamp(0, height - 1), x.clamp(0, width - 1)]
+
+    def weights(self, xy: Float[Tensor, "points 2"], half: int) -> list[Tensor] | None:
+        """Per pyramid level, how much of each window sample lies on the object; ``xy`` in the cut."""
+        if self.inside is None:
+            return None
+        grid = patch_grid(half, xy)
+        return [sample_image(image, xy[:, None] / 2**level + grid) for level, image in enumerate(self.inside)]
+
+
+def erode(mask: Bool[Tensor, "height width"], radius: float) -> Bool[Tensor, "height width"]:
+    """Pixels whose disc of ``radius`` pixels lies in the mask; the outside of the image is outside the mask.
+
+    Example:
+        >>> import torch
+        >>> erode(torch.ones(5, 7, dtype=torch.bool), 2.0).sum().item()
+        3
+    """
+    r = math.ceil(radius)
+    if r <= 0:
+        return mask
+    grid = patch_grid(r, torch.zeros(1, dtype=torch.float32, device=mask.device))
+    disc = ((grid**2).sum(-1) <= radius**2).to(torch.float32).reshape(1, 1, 2 * r + 1, 2 * r + 1)
+    outside = F.pad(1.0 - mask.to(torch.float32)[None, None], (r,) * 4, value=1.0)
+    return F.conv2d(outside, disc)[0, 0] < 0.5
+
+
+def depth_edges(depth: Float[Tensor, "height width"], jump: float, radius: int) -> Bool[Tensor, "height width"]:
+    """Pixels with a depth step of more than ``jump`` metres within ``radius`` pixels, or without depth.
+
+    Example:
+        >>> import torch
+        >>> depth_edges(torch.tensor([[1.0, 1.0, 1.0, 2.0, 2.0]]), 0.1, 1).tolist()
+        [[False, False, True, True, False]]
+    """
+    known = torch.isfinite(depth)
+    side = 2 * radius + 1
+    far = F.max_pool2d(torch.where(known, depth, -torch.inf)[None, None], side, 1, radius)
+    near = F.max_pool2d(torch.where(known, -depth, -torch.inf)[None, None], side, 1, radius)
+    return ((far + near)[0, 0] > jump) | ~known
+
+
+def _box(mask: Tensor, around: Tensor, margin: int) -> tuple[int, int, int, int] | None:
+    """x0, y0, x1, y1 of the mask and the points with a margin, at least 32 pixels a side where the image has them."""
+    height, width = mask.shape
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    corners = [around.amin(0), around.amax(0)] if len(around) else []
+    if len(rows):
+        corners += [torch.stack([columns[0], rows[0]]).to(around), torch.stack([columns[-1], rows[-1]]).to(around)]
+    if not corners:
+        return None
+    box = torch.stack(corners)
+    low, high = (box.amin(0) - margin).floor(), (box.amax(0) + margin).ceil()
+    x0, y0 = (min(max(int(v), 0), max(n - 32, 0)) for v, n in zip(low, (width, height), strict=True))
+    x1, y1 = (min(max(int(v), s + 32), n) for v, s, n in zip(high, (x0, y0), (width, height), strict=True))
+    return x0, y0, x1, y1
+
+
+def cut_region(
+    frame: Float[Tensor, "channels height width"],
+    mask: Bool[Tensor, "height width"] | None,
+    depth: Float[Tensor, "height width"] | None,
+    around: Float[Tensor, "points 2"],
+    *,
+    levels: int,
+    margin: int,
+    birth_margin: float,
+    depth_jump: float,
+    edge_radius: int,
+) -> Region | None:
+    """Cut a frame to the object; None where there is neither mask nor point to look at.
+
+    Args:
+        frame: RGB or grey.
+        mask: the object; None means the whole frame.
+        depth: metres; points keep away from its edges.
+        around: expected positions of living points, pixels, finite.
+        levels: of the pyramid.
+        margin: pixels added around the object's box.
+        birth_margin: pixels that new points keep from the mask's border.
+        depth_jump: metres, see :func:`depth_edges`.
+        edge_radius: pixels, see :func:`depth_edges`.
+    """
+    height, width = frame.shape[-2:]
+    box = (0, 0, width, height) if mask is None else _box(mask, around, margin)
+    if box is None:
+        return None
+    x0, y0, x1, y1 = box
+    gray = to_gray(frame[:, y0:y1, x0:x1])
+    inside = None
+    allowed = births = torch.ones_like(gray, dtype=torch.bool)
+    if mask is not None:
+        allowed = mask[y0:y1, x0:x1]
+        births = erode(allowed, birth_margin)
+        inside = [allowed.to(gray)]
+        for _ in range(levels - 1):
+            inside.append(inside[-1][::2, ::2])
+    if depth is not None:
+        smooth = ~depth_edges(depth[y0:y1, x0:x1], depth_jump, edge_radius)
+        births, allowed = births & smooth, allowed & smooth
+    origin = frame.new_tensor([float(x0), float(y0)])
+    return Region(gray, image_pyramid(gray, levels), inside, births, allowed, origin)
