@@ -35,7 +35,7 @@ class RoundCones:
     rotations: Float[Tensor, "*batch parts 3 3"]
     origins: Float[Tensor, "*batch parts 3"]
     scale: Float[Tensor, "parts 3"]
-    length: Float[Tensor, "parts"]
+    length: Float[Tensor, " parts"]
     radii: Float[Tensor, "parts 2"]
 
     def __post_init__(self) -> None:
@@ -162,7 +162,7 @@ def cast_image(
 
 
 def local_to_outer(
-    cones: RoundCones, part: Int[Tensor, "points"], local: Float[Tensor, "points 3"]
+    cones: RoundCones, part: Int[Tensor, " points"], local: Float[Tensor, "points 3"]
 ) -> Float[Tensor, "*batch points 3"]:
     """Part coordinates (metres, unscaled) to outer axes, in every frame of the batch."""
     rotation = cones.rotations[..., part, :, :]
@@ -170,7 +170,7 @@ def local_to_outer(
 
 
 def surface_normals(
-    cones: RoundCones, part: Int[Tensor, "points"], local: Float[Tensor, "points 3"]
+    cones: RoundCones, part: Int[Tensor, " points"], local: Float[Tensor, "points 3"]
 ) -> Float[Tensor, "points 3"]:
     """Outward unit normals, in part axes, of points on the surface of their part."""
     scale = cones.scale[part]

@@ -34,7 +34,7 @@ class Performance:
         self.trunk, self.arms, self.ball, self.release = trunk, arms, ball, release
 
 
-def vector(*xyz: float) -> Float[Tensor, "3"]:
+def vector(*xyz: float) -> Float[Tensor, " 3"]:
     """A float64 vector."""
     return torch.tensor(xyz, dtype=torch.float64)
 
@@ -55,7 +55,7 @@ def standing(body: Body, frames: int, width: float = 0.13, stagger: float = 0.0,
     """
     h = body.stature
     zeros = torch.zeros(frames, 3, dtype=torch.float64)
-    root = zeros + vector(0, standing_height(body), 0)
+    root = zeros + vector(0.0, standing_height(body), 0.0)
     toe = torch.stack(
         [
             vector(0.5 * width * h, body.toe_height, 0.065 * h - 0.5 * stagger * h),
@@ -133,7 +133,7 @@ def blend_arms(first: Arms, second: Arms, weight: Float[Tensor, "frames 2"]) -> 
 
 
 def throw(
-    t: Float[Tensor, "frames"], start: Float[Tensor, "3"], velocity: Float[Tensor, "3"], bounce: float = 0.75
+    t: Float[Tensor, " frames"], start: Float[Tensor, " 3"], velocity: Float[Tensor, " 3"], bounce: float = 0.75
 ) -> Float[Tensor, "frames 3"]:
     """Flight under gravity from ``start`` at t = 0, with bounces off the floor (times in seconds, t >= 0)."""
     position = start + t[:, None] * velocity

@@ -7,8 +7,8 @@ or that of the frame (weak perspective), so all three give images of the same si
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -19,9 +19,9 @@ from torchrecon.data.synthetic.motion import Motion
 from torchrecon.data.synthetic.random import chance, uniform
 from torchrecon.errors import ReconError
 
-__all__ = ["Camera", "Projection", "handheld_camera", "panning_camera", "static_camera", "turning_camera"]
+__all__ = ["Camera", "handheld_camera", "panning_camera", "static_camera", "turning_camera"]
 
-Projection = Literal["pinhole", "weak_perspective", "orthographic"]
+_PROJECTIONS = ("pinhole", "weak_perspective", "orthographic")
 _FOCAL_PER_HEIGHT = 2.0
 """Default focal length over image height: 1.8 m at 7 m is about 300 of 576 pixels."""
 
@@ -43,8 +43,8 @@ class Camera:
     translations: Float[Tensor, "frames 3"]
     intrinsics: Float[Tensor, "3 3"]
     size: tuple[int, int]
-    projection: Projection
-    reference_depth: Float[Tensor, "frames"]
+    projection: str
+    reference_depth: Float[Tensor, " frames"]
 
     def to_camera(self, world: Float[Tensor, "frames points 3"]) -> Float[Tensor, "frames points 3"]:
         """World metres to camera axes, each frame by its own pose."""
@@ -77,12 +77,12 @@ def _look_at(position: Tensor, target: Tensor) -> Tensor:
 
 def _camera(
     motion: Motion, position: Tensor, rotation: Tensor, size: tuple[int, int], focal: float | None,
-    projection: Projection,
+    projection: str,
 ) -> Camera:  # fmt: skip
-    if projection not in ("pinhole", "weak_perspective", "orthographic"):
-        raise ReconError(f"projection: {projection!r} is not known; use pinhole, weak_perspective or orthographic")
+    if projection not in _PROJECTIONS:
+        raise ReconError(f"projection: {projection!r} is not known; use one of {', '.join(_PROJECTIONS)}")
     height, width = size
-    f = _FOCAL_PER_HEIGHT * height if focal is None else focal
+    f = _zoom(motion, position, rotation, size) if focal is None else focal
     k = torch.tensor([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64)
     translation = -torch.einsum("fij,fj->fi", rotation, position)
     root = motion.joints[:, 0].double()
@@ -91,6 +91,15 @@ def _camera(
         depth = depth.mean().expand_as(depth).clone()
     dtype = motion.joints.dtype
     return Camera(rotation.to(dtype), translation.to(dtype), k.to(dtype), (height, width), projection, depth.to(dtype))
+
+
+def _zoom(motion: Motion, position: Tensor, rotation: Tensor, size: tuple[int, int]) -> float:
+    """The default focal length, or the shorter one that keeps every joint within 96 % of the image."""
+    height, width = size
+    points = (motion.joints.double() - position[:, None]) @ rotation.transpose(-1, -2)
+    half = torch.tensor([0.48 * width, 0.48 * height], dtype=torch.float64)
+    fits = half * points[..., 2:] / points[..., :2].abs().clamp_min(1e-6)
+    return min(_FOCAL_PER_HEIGHT * height, float(fits.amin()))
 
 
 def _smooth_root(motion: Motion, seconds: float = 0.25) -> Tensor:
@@ -108,13 +117,11 @@ def _smooth_root(motion: Motion, seconds: float = 0.25) -> Tensor:
 
 
 def _aim(motion: Motion, follow: bool) -> Tensor:
-    """The point that the camera looks at: over the pelvis at 0.6 of the tallest pose's standing height."""
+    """The point that the camera looks at: over the pelvis, half-way up to the highest point that the clip reaches."""
     root = _smooth_root(motion)
     if not follow:
         root = 0.5 * (root.amin(0) + root.amax(0)).expand_as(root).clone()
-    # Raised arms and jumps need room above, so the aim is a little above the pelvis.
-    head = float(motion.joints[:, motion.names.index("head"), 1].double().median())
-    root[:, 1] = 0.62 * head
+    root[:, 1] = 0.5 * float(motion.joints[..., 1].max())
     return root
 
 
@@ -125,7 +132,7 @@ def turning_camera(
     size: tuple[int, int] = (576, 768),
     focal: float | None = None,
     generator: torch.Generator | None = None,
-    projection: Projection = "pinhole",
+    projection: str = "pinhole",
 ) -> Camera:
     """A camera that orbits the player and follows him.
 
@@ -134,7 +141,8 @@ def turning_camera(
         total_turn_deg: angle of the orbit over the whole clip, degrees; the direction is drawn.
         distance: metres from the player.
         size: (height, width) pixels.
-        focal: pixels; default twice the image height (1.8 m at 7 m: about 300 of 576 pixels).
+        focal: pixels; default twice the image height (1.8 m at 7 m: about 300 of 576 pixels), or less where the
+            player would leave the image.
         projection: ``pinhole``, ``weak_perspective`` or ``orthographic``.
     """
     g = generator
@@ -143,11 +151,18 @@ def turning_camera(
     sign = 1.0 if chance(g, 0.5) else -1.0
     uneven = uniform(g, -0.15, 0.15) / (2 * torch.pi)
     progress = progress + uneven * torch.sin(2 * torch.pi * progress)
-    angle = uniform(g, 0, 2 * torch.pi) + sign * torch.deg2rad(torch.tensor(float(total_turn_deg)).double()) * progress
+    angle = (
+        uniform(g, 0.0, 2 * torch.pi) + sign * torch.deg2rad(torch.tensor(float(total_turn_deg)).double()) * progress
+    )
     height = uniform(g, 0.9, 2.2)
     position = aim + distance * torch.stack([angle.sin(), 0 * angle, angle.cos()], -1)
     position[:, 1] = height
     return _camera(motion, position, _look_at(position, aim), size, focal, projection)
+
+
+def _around(angle: float) -> Tensor:
+    """Unit vector on the floor; 0 is world z."""
+    return torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64)
 
 
 def _fixed_position(motion: Motion, distance: float, generator: torch.Generator | None) -> Tensor:
@@ -155,10 +170,10 @@ def _fixed_position(motion: Motion, distance: float, generator: torch.Generator 
     root = motion.joints[:, 0].double()
     centre = 0.5 * (root.amin(0) + root.amax(0))
     travel = root[-1] - root[0]
-    angle = uniform(generator, 0, 2 * torch.pi)
+    angle = uniform(generator, 0.0, 2 * torch.pi)
     if float(travel[[0, 2]].norm()) > 2.0:
         angle = float(torch.atan2(travel[0], travel[2])) + uniform(generator, -0.5, 0.5)
-    position = centre + distance * torch.tensor([torch.sin(torch.tensor(angle)), 0, torch.cos(torch.tensor(angle))])
+    position = centre + distance * _around(angle)
     position[1] = uniform(generator, 1.0, 2.2)
     return position
 
@@ -169,7 +184,7 @@ def static_camera(
     size: tuple[int, int] = (576, 768),
     focal: float | None = None,
     generator: torch.Generator | None = None,
-    projection: Projection = "pinhole",
+    projection: str = "pinhole",
 ) -> Camera:
     """A camera on a tripod.
 
@@ -177,6 +192,7 @@ def static_camera(
     runner is seen from farther away than a shooter. Travelling players are filmed from nearly ahead.
     """
     at = _fixed_position(motion, distance, generator)
+    focal = _FOCAL_PER_HEIGHT * size[0] if focal is None else focal
     aim = _aim(motion, follow=False)
     for _ in range(60):
         position = at.expand_as(aim)
@@ -193,7 +209,9 @@ def _keeps_in_view(camera: Camera, motion: Motion) -> bool:
     xy = camera.project(points)
     height, width = camera.size
     margin = 0.02 * height
-    inside = (xy[..., 0] > margin) & (xy[..., 0] < width - margin) & (xy[..., 1] > margin) & (xy[..., 1] < height - margin)
+    inside = (
+        (xy[..., 0] > margin) & (xy[..., 0] < width - margin) & (xy[..., 1] > margin) & (xy[..., 1] < height - margin)
+    )
     return bool((inside & (points[..., 2] > 1.0)).all())
 
 
@@ -203,18 +221,18 @@ def panning_camera(
     size: tuple[int, int] = (576, 768),
     focal: float | None = None,
     generator: torch.Generator | None = None,
-    projection: Projection = "pinhole",
+    projection: str = "pinhole",
 ) -> Camera:
     """A tripod whose head follows the player; ``distance`` is to the middle of his path, from the side if he runs."""
     root = motion.joints[:, 0].double()
     travel = root[-1] - root[0]
-    angle = uniform(generator, 0, 2 * torch.pi)
+    angle = uniform(generator, 0.0, 2 * torch.pi)
     if float(travel[[0, 2]].norm()) > 2.0:
         side = torch.pi / 2 if chance(generator, 0.5) else -torch.pi / 2
         angle = float(torch.atan2(travel[0], travel[2])) + side + uniform(generator, -0.4, 0.4)
     aim = _aim(motion, follow=True)
     centre = 0.5 * (aim.amin(0) + aim.amax(0))
-    position = centre + distance * torch.tensor([torch.sin(torch.tensor(angle)), 0, torch.cos(torch.tensor(angle))])
+    position = centre + distance * _around(angle)
     position[1] = uniform(generator, 1.0, 2.2)
     position = position.expand_as(aim)
     return _camera(motion, position, _look_at(position, aim), size, focal, projection)
@@ -226,7 +244,7 @@ def handheld_camera(
     size: tuple[int, int] = (576, 768),
     focal: float | None = None,
     generator: torch.Generator | None = None,
-    projection: Projection = "pinhole",
+    projection: str = "pinhole",
     shake: float = 1.0,
 ) -> Camera:
     """A person who films while keeping the distance: slow drift, sway of some centimetres, aim off by some degrees.
@@ -238,7 +256,7 @@ def handheld_camera(
     aim = _aim(motion, follow=True)
     t = torch.arange(len(motion), dtype=torch.float64) / motion.fps
     drift = uniform(g, -0.35, 0.35) * smoothstep(t / max(float(t[-1]), 1e-6))
-    angle = uniform(g, 0, 2 * torch.pi) + drift
+    angle = uniform(g, 0.0, 2 * torch.pi) + drift
     position = aim + distance * torch.stack([angle.sin(), 0 * angle, angle.cos()], -1)
     position[:, 1] = uniform(g, 1.4, 1.75)
     position = position + 0.04 * shake * smooth_noise(t, g, 1.5, 3)

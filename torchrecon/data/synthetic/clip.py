@@ -30,7 +30,7 @@ _CHUNK = 2_000_000
 class SurfacePoints:
     """Points fixed to the body: part index (-1: not on the body) and part coordinates in metres (NaN there)."""
 
-    part: Int[Tensor, "points"]
+    part: Int[Tensor, " points"]
     local: Float[Tensor, "points 3"]
 
     def __len__(self) -> int:
@@ -135,9 +135,7 @@ class SyntheticClip:
 
     def render(self, index: int) -> SyntheticFrame:
         """Render one frame (0-based); about 0.1 s of CPU at 768 x 576."""
-        frame = render_frame(
-            self._scene_at(index), self.camera, index, self._textures, self._court, self.supersample
-        )
+        frame = render_frame(self._scene_at(index), self.camera, index, self._textures, self._court, self.supersample)
         if self.sensor_noise is None:
             return frame
         generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + index)
@@ -175,9 +173,7 @@ class SyntheticClip:
         step = max(1, _CHUNK // max(1, len(points)))
         for begin in range(0, len(self), step):
             block = slice(begin, begin + step)
-            cones = RoundCones(
-                scene.rotations[block], scene.origins[block], scene.scale, scene.length, scene.radii
-            )
+            cones = RoundCones(scene.rotations[block], scene.origins[block], scene.scale, scene.length, scene.radii)
             origins, directions = self._sight(xyz[block])
             first, _ = cast_rays(cones, origins, directions)
             seen[block] &= xyz[block][..., 2] <= first + _TOLERANCE

@@ -1,4 +1,4 @@
-"""The hall around the player: a floor with planks and lines and four walls, as geometry, so it moves with the camera."""
+"""The hall around the player: a floor with planks and lines, four walls; geometry, so it moves with the camera."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Court:
     """
 
     floor: Float[Tensor, "2 3 rows cols"]
-    walls: Float[Tensor, "3 rows cols"]
+    walls: Float[Tensor, "3 steps perimeter"]
 
     def view(
         self, origins: Float[Tensor, "height width 3"], directions: Float[Tensor, "height width 3"]
@@ -57,7 +57,9 @@ class Court:
         side = torch.where(on_x, torch.where(dx > 0, 0.0, 2.0), torch.where(dz > 0, 1.0, 3.0)).to(along)
         u = (side + 0.5 * (along + 1)) / 2 - 1
         v = 1 - 2 * y / CEILING
-        walls = F.grid_sample(self.walls[None], torch.stack([u, v], -1)[None], padding_mode="border", align_corners=False)[0]
+        walls = F.grid_sample(
+            self.walls[None], torch.stack([u, v], -1)[None], padding_mode="border", align_corners=False
+        )[0]
         return torch.where(ground < wall, floor, walls), t
 
 

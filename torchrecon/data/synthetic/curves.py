@@ -13,7 +13,9 @@ from torchrecon._typing import Float, Tensor
 __all__ = ["bridge", "keys", "smooth_noise", "smoothstep", "upper_envelope"]
 
 
-def keys(t: Float[Tensor, "frames"], times: Sequence[float], values: Sequence[object]) -> Float[Tensor, "frames *rest"]:
+def keys(
+    t: Float[Tensor, " frames"], times: Sequence[float], values: Sequence[object]
+) -> Float[Tensor, " frames *rest"]:
     """Monotone cubic through ``(times, values)``, constant outside; it never overshoots a key.
 
     Args:
@@ -33,7 +35,7 @@ def keys(t: Float[Tensor, "frames"], times: Sequence[float], values: Sequence[ob
 
 
 def bridge(
-    t: Float[Tensor, "n"], times: Sequence[float], values: Sequence[object], start_slope: object, end_slope: object
+    t: Float[Tensor, " n"], times: Sequence[float], values: Sequence[object], start_slope: object, end_slope: object
 ) -> Float[Tensor, "n 3"]:
     """C2 cubic through vectors with given velocities at both ends (a foot's swing between two plants)."""
     slopes = [np.asarray(s, dtype=np.float64) for s in (start_slope, end_slope)]
@@ -55,7 +57,7 @@ def smoothstep(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
 
 def smooth_noise(
-    t: Float[Tensor, "frames"], generator: torch.Generator | None, frequency: float, channels: int
+    t: Float[Tensor, " frames"], generator: torch.Generator | None, frequency: float, channels: int
 ) -> Float[Tensor, "frames channels"]:
     """Band-limited random sway, standard deviation about 1: five sines up to ``frequency`` hertz."""
     rate = frequency * (0.2 + 0.8 * torch.rand(channels, 5, generator=generator, dtype=torch.float64))
@@ -64,11 +66,12 @@ def smooth_noise(
     return (wave.sum(-1) * (2 / 5) ** 0.5).to(t.dtype)
 
 
-def upper_envelope(x: Float[Tensor, "frames"], radius: int) -> Float[Tensor, "frames"]:
+def upper_envelope(x: Float[Tensor, " frames"], radius: int) -> Float[Tensor, " frames"]:
     """A smooth curve that is nowhere below ``x``: sliding maximum, then a kernel of the same width."""
     pool = torch.nn.functional.max_pool1d(_edge(x, radius)[None], 2 * radius + 1, stride=1)[0]
     taps = torch.hann_window(2 * radius + 3, periodic=False, dtype=x.dtype)[1:-1]
-    return torch.nn.functional.conv1d(_edge(pool, radius)[None, None], (taps / taps.sum())[None, None])[0, 0]
+    smooth: Tensor = torch.nn.functional.conv1d(_edge(pool, radius)[None, None], (taps / taps.sum())[None, None])[0, 0]
+    return smooth
 
 
 def _edge(x: Tensor, radius: int) -> Tensor:

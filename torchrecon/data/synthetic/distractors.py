@@ -27,8 +27,8 @@ __all__ = ["bounce_cycle", "dribble", "idle"]
 
 
 def bounce_cycle(
-    t: Float[Tensor, "frames"], top: float, speed: float, contact: float, restitution: float = 0.82
-) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
+    t: Float[Tensor, " frames"], top: float, speed: float, contact: float, restitution: float = 0.82
+) -> tuple[Float[Tensor, " frames"], Float[Tensor, " frames"]]:
     """Height of a dribbled ball over time, and how far the hand is on it.
 
     The hand leaves the ball at height ``top`` (metres) with downward ``speed``; the ball falls, bounces with
@@ -59,7 +59,7 @@ def bounce_cycle(
     return height, free
 
 
-def dribble(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | None) -> Performance:
+def dribble(body: Body, t: Float[Tensor, " frames"], generator: torch.Generator | None) -> Performance:
     """A crouched player bounces the ball beside (one hand) or before (two hands) himself, standing or walking."""
     g, h = generator, body.stature
     two = chance(g, 0.35)
@@ -87,7 +87,7 @@ def dribble(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator |
     top = uniform(g, 0.40, 0.52) * h
     shifted = t + uniform(g, 0.0, 0.6)
     height, free = bounce_cycle(shifted, top, uniform(g, 1.2, 2.4), uniform(g, 0.16, 0.26))
-    side = vector(0, 0, 0.27 * h) if two else vector(-uniform(g, 0.13, 0.19) * h, 0, uniform(g, 0.14, 0.22) * h)
+    side = vector(0.0, 0.0, 0.27 * h) if two else vector(-uniform(g, 0.13, 0.19) * h, 0.0, uniform(g, 0.14, 0.22) * h)
     ball = trunk.stance.root + to_world(trunk, side.expand(len(t), 3))
     ball = torch.stack([ball[:, 0], height, ball[:, 2]], -1)
     # While the ball is down the hand waits a little above the place where it will come back.
@@ -95,8 +95,8 @@ def dribble(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator |
     waiting[:, 1] = torch.maximum(height, torch.tensor(top - 0.05 * h)) + 0.03 * h * free
     spread = torch.stack([vector(0.45 if two else 0.8, 0.9, -0.15), vector(-0.45 if two else -0.05, 0.95, -0.15)])
     contact = to_world(trunk, spread.expand(len(t), 2, 3))
-    palm = to_world(trunk, torch.stack([vector(-0.2, -0.1, 1), vector(0.2, -0.1, 1)]).expand(len(t), 2, 3))
-    elbow = to_world(trunk, torch.stack([vector(0.7, 0, -0.7), vector(-0.7, 0, -0.7)]).expand(len(t), 2, 3))
+    palm = to_world(trunk, torch.stack([vector(-0.2, -0.1, 1.0), vector(0.2, -0.1, 1.0)]).expand(len(t), 2, 3))
+    elbow = to_world(trunk, torch.stack([vector(0.7, 0.0, -0.7), vector(-0.7, 0.0, -0.7)]).expand(len(t), 2, 3))
     arms = grip(body, waiting, contact, palm, elbow)
     if not two:
         angle = torch.full((len(t), 2), uniform(g, 0.2, 0.7), dtype=torch.float64) + 0.06 * smooth_noise(t, g, 0.8, 2)
@@ -105,7 +105,7 @@ def dribble(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator |
     return Performance(trunk, arms, ball)
 
 
-def idle(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | None) -> Performance:
+def idle(body: Body, t: Float[Tensor, " frames"], generator: torch.Generator | None) -> Performance:
     """Standing about: weight shifts, looking around, arms hanging, on the hips, or holding the ball."""
     g, h = generator, body.stature
     stance = standing(body, len(t), uniform(g, 0.12, 0.22), uniform(g, -0.08, 0.08), uniform(g, 0.05, 0.3))
@@ -128,10 +128,14 @@ def idle(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | No
         akimbo = trunk.stance.root[:, None] + to_world(trunk, hips.expand(len(t), 2, 3))
         arms.wrist[:] = akimbo
         arms.palm = to_world(trunk, torch.stack([vector(-0.5, -0.6, 0.6), vector(0.5, -0.6, 0.6)]).expand(len(t), 2, 3))
-        arms.elbow = to_world(trunk, torch.stack([vector(1, 0, -0.5), vector(-1, 0, -0.5)]).expand(len(t), 2, 3))
+        arms.elbow = to_world(
+            trunk, torch.stack([vector(1.0, 0.0, -0.5), vector(-1.0, 0.0, -0.5)]).expand(len(t), 2, 3)
+        )
         return Performance(trunk, arms)
     if style < 0.6:
-        ball = trunk.position["neck"] + to_world(trunk, (h * vector(0, uniform(g, -0.32, -0.2), 0.19)).expand(len(t), 3))
+        ball = trunk.position["neck"] + to_world(
+            trunk, (h * vector(0.0, uniform(g, -0.32, -0.2), 0.19)).expand(len(t), 3)
+        )
         ball[:, 1] += 0.012 * h * slow[:, 7]
         sides = torch.tensor([[1.0, 1, 1], [-1.0, 1, 1]], dtype=torch.float64)
         directions = [vector(0.9, -0.1, -0.3), vector(-0.1, 0.2, 1.0), vector(0.6, -0.8, -0.4)]

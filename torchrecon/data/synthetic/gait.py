@@ -58,7 +58,9 @@ def _path(gait: Gait, t: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([radius * (1 - heading.cos()), 0 * t, radius * heading.sin()], -1), heading
 
 
-def step_along(body: Body, t: Float[Tensor, "frames"], gait: Gait, phase: float) -> tuple[Stance, Float[Tensor, "frames"]]:
+def step_along(
+    body: Body, t: Float[Tensor, " frames"], gait: Gait, phase: float
+) -> tuple[Stance, Float[Tensor, " frames"]]:
     """A stance that walks or runs.
 
     Args:
@@ -140,7 +142,7 @@ def _one_cycle(
     stance.foot_yaw[up, side] = here_yaw + blend * (there_yaw - here_yaw)
 
 
-def run(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | None) -> Performance:
+def run(body: Body, t: Float[Tensor, " frames"], generator: torch.Generator | None) -> Performance:
     """Jog to fast run, straight or on a bend, arms pumping against the legs."""
     g, h = generator, body.stature
     speed = uniform(g, 2.8, 5.2) * (h / 1.8) ** 0.5

@@ -21,7 +21,10 @@ def _hermite(t: Tensor, t0: float, y0: float, v0: float, t1: float, y1: float, v
     s = (t - t0) / (t1 - t0)
     d = t1 - t0
     return (
-        (1 + 2 * s) * (1 - s) ** 2 * y0 + s * (1 - s) ** 2 * d * v0 + s * s * (3 - 2 * s) * y1 + s * s * (s - 1) * d * v1
+        (1 + 2 * s) * (1 - s) ** 2 * y0
+        + s * (1 - s) ** 2 * d * v0
+        + s * s * (3 - 2 * s) * y1
+        + s * s * (s - 1) * d * v1
     )
 
 
@@ -46,7 +49,7 @@ class Leap:
         self.landings = tuple(t + self.flight for t in takeoffs)
         self.height, self.depth, self.stretch, self.rest = height, depth, stretch, rest
 
-    def rise(self, t: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
+    def rise(self, t: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
         """Pelvis height over standing, metres."""
         depth, stretch, v = self.depth, self.stretch, self.speed
         dip = self.takeoffs[0] - self.push
@@ -59,17 +62,19 @@ class Leap:
             absorbed = land + self.push
             y = torch.where(t >= land, _hermite(t, land, stretch, -v, absorbed, -depth, 0.0), y)
             last = index + 1 == len(self.takeoffs)
-            y = torch.where(t >= absorbed, -depth * (1 - smoothstep((t - absorbed) / 0.6)) if last else -depth + 0 * t, y)
+            y = torch.where(
+                t >= absorbed, -depth * (1 - smoothstep((t - absorbed) / 0.6)) if last else -depth + 0 * t, y
+            )
         return y
 
-    def airborne(self, t: Float[Tensor, "frames"]) -> Bool[Tensor, "frames"]:
+    def airborne(self, t: Float[Tensor, " frames"]) -> Bool[Tensor, " frames"]:
         """The toes are off the floor."""
         flags = torch.zeros_like(t, dtype=torch.bool)
         for off, land in zip(self.takeoffs, self.landings, strict=True):
             flags |= (t > off) & (t < land)
         return flags
 
-    def heel(self, t: Float[Tensor, "frames"], takeoff: float = 0.95, flight: float = 0.7) -> Float[Tensor, "frames"]:
+    def heel(self, t: Float[Tensor, " frames"], takeoff: float = 0.95, flight: float = 0.7) -> Float[Tensor, " frames"]:
         """Foot pitch, radians."""
         times, values = [self.takeoffs[0] - self.push], [0.0]
         for off, land in zip(self.takeoffs, self.landings, strict=True):
@@ -78,7 +83,7 @@ class Leap:
             values += [0.12, takeoff, flight, 0.75 * flight, 0.0]
         return keys(t, times, values)
 
-    def apply(self, t: Float[Tensor, "frames"], stance: Stance, tuck: float = 0.0, forward: float = 0.0) -> None:
+    def apply(self, t: Float[Tensor, " frames"], stance: Stance, tuck: float = 0.0, forward: float = 0.0) -> None:
         """Write the leap into a stance: pelvis, toes, heels and contacts.
 
         Args:
@@ -99,7 +104,7 @@ class Leap:
         stance.planted[:] = ~air[:, None]
 
 
-def jump(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | None) -> Performance:
+def jump(body: Body, t: Float[Tensor, " frames"], generator: torch.Generator | None) -> Performance:
     """Vertical or slightly forward jumps with an arm swing: one big jump, or rebounds one after the other."""
     g, h = generator, body.stature
     height = uniform(g, 0.13, 0.27) * h

@@ -23,7 +23,7 @@ from torchrecon.data.synthetic.random import chance, uniform
 __all__ = ["pass_ball"]
 
 
-def pass_ball(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | None) -> Performance:
+def pass_ball(body: Body, t: Float[Tensor, " frames"], generator: torch.Generator | None) -> Performance:
     """Ball drawn in to the chest (or behind the head), a step, a two-handed push (or throw), arms stay out."""
     g, h = generator, body.stature
     overhead = chance(g, 0.4)
@@ -44,7 +44,7 @@ def pass_ball(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator
     shift = keys(t, [lift - 0.3, lift, release, release + 0.9], [0.0, -0.08, 0.62, uniform(g, 0.35, 0.6)])
     stance.root[:, 2] += length * shift
     crouch = uniform(g, 0.03, 0.08) * h
-    stance.root[:, 1] -= crouch * keys(t, [0.0, lift, release, release + 0.8], [0.5, 1.0, 0.8, 0.3])
+    stance.root[:, 1] -= crouch * keys(t, [lift - 0.7, lift, release, release + 0.8], [0.5, 1.0, 0.8, 0.3])
     lean = keys(t, [lift - 0.2, lift + 0.05, release + 0.05, release + 0.8], [0.10, 0.02, 0.26, 0.14])
     stance.root_turn[:, 1] = 0.5 * lean
     stance.spine_turn[:, 1] = lean * uniform(g, 0.6, 1.1) - 0.1
@@ -97,6 +97,6 @@ def pass_ball(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator
     ball = held.clone()
     if index is not None:
         slope = uniform(g, 0.05, 0.2)
-        direction = to_world(trunk, vector(0, slope, 1).expand(len(t), 3))[index]
+        direction = to_world(trunk, vector(0.0, slope, 1.0).expand(len(t), 3))[index]
         ball[index:] = throw(t[index:] - t[index], held[index], uniform(g, 7.5, 10.5) * direction)
     return Performance(trunk, arms, ball, index)

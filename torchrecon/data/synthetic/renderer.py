@@ -127,7 +127,12 @@ def _boxes(scene: RoundCones, camera: Camera, index: int) -> Int[Tensor, "parts 
 
 
 def _background(
-    court: Court, size: tuple[int, int], origin_map: Tensor, direction_map: Tensor, rotation: Tensor, translation: Tensor
+    court: Court,
+    size: tuple[int, int],
+    origin_map: Tensor,
+    direction_map: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
 ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
     """Colour of the hall, cast at every other pixel (a background slightly out of focus), and its depth."""
     height, width = size

@@ -24,7 +24,7 @@ from torchrecon.data.synthetic.random import chance, uniform
 __all__ = ["shoot"]
 
 
-def shoot(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | None) -> Performance:
+def shoot(body: Body, t: Float[Tensor, " frames"], generator: torch.Generator | None) -> Performance:
     """Ball from the waist over the set point above the forehead to the release overhead, then the follow-through."""
     g, h = generator, body.stature
     duration = float(t[-1])
@@ -49,7 +49,9 @@ def shoot(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | N
     stance.root[:, 2] -= 0.045 * h * crouch
     stance.root_turn[:, 0] = uniform(g, 0.0, 0.35)
     stance.root_turn[:, 1] = uniform(g, 0.15, 0.3) * crouch
-    stance.spine_turn[:, 1] = 0.2 * crouch - keys(t, [release - 0.4, release, release + 0.7], [0.0, uniform(g, 0, 0.15), 0])
+    stance.spine_turn[:, 1] = 0.2 * crouch - keys(
+        t, [release - 0.4, release, release + 0.7], [0.0, uniform(g, 0.0, 0.15), 0]
+    )
     stance.spine_turn[:, 0] = uniform(g, -0.1, 0.15) * smoothstep((t - dip) / 0.4)
     stance.spine_turn += 0.015 * smooth_noise(t, g, 0.8, 3)
     stance.head_turn[:, 1] = -0.25 - 0.1 * crouch
@@ -90,7 +92,7 @@ def shoot(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | N
     reach = torch.stack([vector(-0.05, 0.83, 0.44), vector(0.0, 0.86, 0.48)]) * arm * torch.tensor([[0.86], [0.985]])
     through = arms.__class__(
         trunk.shoulders + to_world(trunk, reach.expand(len(t), 2, 3)),
-        to_world(trunk, torch.stack([vector(-0.2, 0.9, 0.4), vector(0, -0.35, 1.0)]).expand(len(t), 2, 3)),
+        to_world(trunk, torch.stack([vector(-0.2, 0.9, 0.4), vector(0.0, -0.35, 1.0)]).expand(len(t), 2, 3)),
         elbow,
     )
     drop = 0.35 + uniform(g, 0.05, 0.3)
@@ -104,8 +106,10 @@ def shoot(body: Body, t: Float[Tensor, "frames"], generator: torch.Generator | N
     index = int(gone.nonzero()[0]) if gone.any() else None
     ball = held.clone()
     if index is not None:
-        forward = to_world(trunk, vector(0, 0, 1).expand(len(t), 3))[index]
+        forward = to_world(trunk, vector(0.0, 0.0, 1.0).expand(len(t), 3))[index]
         speed, angle = uniform(g, 7.0, 9.2), uniform(g, 0.80, 1.0)
-        velocity = speed * (forward * torch.cos(torch.tensor(angle)) + vector(0, 1, 0) * torch.sin(torch.tensor(angle)))
+        velocity = speed * (
+            forward * torch.cos(torch.tensor(angle)) + vector(0.0, 1.0, 0.0) * torch.sin(torch.tensor(angle))
+        )
         ball[index:] = throw(t[index:] - t[index], held[index], velocity)
     return Performance(trunk, arms, ball, index)

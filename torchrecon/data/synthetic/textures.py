@@ -32,8 +32,8 @@ class SolidTexture:
     """Colours (3, Z, Y, X) over the box from ``low`` to ``high`` (metres, part axes)."""
 
     colours: Float[Tensor, "3 depth height width"]
-    low: Float[Tensor, "3"]
-    high: Float[Tensor, "3"]
+    low: Float[Tensor, " 3"]
+    high: Float[Tensor, " 3"]
 
 
 def sample_texture(texture: SolidTexture, local: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
@@ -45,7 +45,7 @@ def sample_texture(texture: SolidTexture, local: Float[Tensor, "points 3"]) -> F
 
 
 def value_noise(
-    extent: Float[Tensor, "d"], shape: tuple[int, ...], cells: tuple[float, ...], generator: torch.Generator
+    extent: Float[Tensor, " d"], shape: tuple[int, ...], cells: tuple[float, ...], generator: torch.Generator
 ) -> Tensor:
     """Sum of random lattices of the given cell sizes (same unit as ``extent``), in 2 or 3 dimensions.
 
@@ -59,7 +59,8 @@ def value_noise(
         values = torch.randn(lattice, generator=generator, dtype=torch.float32)
         mode = "trilinear" if len(shape) == 3 else "bilinear"
         total += F.interpolate(values[None, None], size=shape, mode=mode, align_corners=True)[0, 0]
-    return total / len(cells) ** 0.5
+    total /= len(cells) ** 0.5
+    return total
 
 
 def _colour(generator: torch.Generator, low: float, high: float) -> Tensor:
@@ -96,11 +97,18 @@ def body_textures(body: Body) -> list[SolidTexture]:
         limb = name[2:] if name[1] == "_" else name
         extent = high - low
         noise = torch.stack([value_noise(extent, shape, (0.10, 0.05, 0.028, 0.016), g) for _ in range(2)])
-        base = {"thigh": shorts, "pelvis": shorts, "chest": jersey, "abdomen": jersey, "foot": shoe}.get(limb, skin)
+        base = {
+            "thigh": shorts,
+            "pelvis": shorts,
+            "chest": jersey,
+            "collar": jersey,
+            "abdomen": jersey,
+            "foot": shoe,
+        }.get(limb, skin)
         colour = base[:, None, None, None].expand(3, *shape).clone()
         x, y, z = xyz
         contrast = 0.085
-        if limb in ("chest", "abdomen", "pelvis", "thigh"):
+        if limb in ("chest", "collar", "abdomen", "pelvis", "thigh"):
             contrast = 0.17
             band = torch.remainder(y + 0.02 * noise[1], stripes) < 0.22 * stripes
             side = x.abs() > 0.82 * float(high[0])
