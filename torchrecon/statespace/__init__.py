@@ -9,8 +9,10 @@ from torchrecon.statespace.abg import (
     abg_tracking_index,
     abg_update,
 )
+from torchrecon.statespace.rts import Smoothed, best_tracking_index, rts_smooth
 
 __all__ = [
+    "Smoothed",
     "abg_alpha",
     "abg_covariance",
     "abg_gains",
@@ -18,4 +20,6 @@ __all__ = [
     "abg_predict",
     "abg_tracking_index",
     "abg_update",
+    "best_tracking_index",
+    "rts_smooth",
 ]
