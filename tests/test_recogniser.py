@@ -1,0 +1,208 @@
+"""The read-out (what it must not see, and must) and the recogniser."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrecon.errors import ReconError
+from torchrecon.models.recogniser import (
+    ReadOut,
+    Recogniser,
+    classify_windows,
+    load_recogniser,
+    read_out,
+    save_recogniser,
+    weights_hash,
+)
+
+ROOT = Path(__file__).parents[1]
+VIEWS = ReadOut(views=("across", "side", "top"))
+
+
+def _camera(angle):
+    """A level camera whose optical axis has this angle to world -Z about Y, one per frame."""
+    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
+    forward = torch.stack([angle.sin(), zero, -angle.cos()], -1)
+    down = torch.stack([zero, -one, zero], -1)
+    return torch.stack([torch.linalg.cross(down, forward), down, forward], -2)
+
+
+def _clip(generator, frames=12, points=60, turn=math.pi):
+    """A bending cloud, taller than wide, before a turning camera."""
+    rest = torch.randn(points, 3, generator=generator) * torch.tensor([0.2, 0.5, 0.3])
+    bend = torch.linspace(-1, 1, frames)[:, None] * rest[:, 1].square()
+    world = torch.stack([rest[:, 0] + bend, rest[:, 1].expand_as(bend), rest[:, 2] - 0.5 * bend], -1)
+    rotations = _camera(torch.linspace(0, turn, frames))
+    visible = torch.rand(frames, points, generator=generator) < 0.6
+    return world @ rotations.transpose(-1, -2), visible, rotations
+
+
+def test_scale_and_translation_of_each_frame_change_nothing(generator):
+    points, visible, rotations = _clip(generator)
+    moved = 37.0 * points + 100 * torch.randn(len(points), 1, 3, generator=generator)
+    expected = read_out(points, visible, rotations, VIEWS)
+    torch.testing.assert_close(read_out(moved, visible, rotations, VIEWS), expected, atol=2e-3, rtol=0)
+
+
+def test_unseen_entries_are_never_read(generator):
+    points, visible, rotations = _clip(generator)
+    expected = read_out(points, visible, rotations, VIEWS)
+    hidden = torch.where(visible[..., None], points, torch.nan)
+    assert torch.equal(read_out(hidden, visible, rotations, VIEWS), expected)
+
+
+def test_order_of_points_changes_nothing(generator):
+    points, visible, rotations = _clip(generator)
+    order = torch.randperm(points.shape[1], generator=generator)
+    shuffled = read_out(points[:, order], visible[:, order], rotations, VIEWS)
+    torch.testing.assert_close(shuffled, read_out(points, visible, rotations, VIEWS), atol=1e-5, rtol=0)
+
+
+def test_yaw_is_a_turn_of_the_world(generator):
+    points, visible, rotations = _clip(generator)
+    yaw = 0.7
+    turn = torch.tensor(
+        [[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]]
+    )  # about +Y: what read_out does to the world before it looks
+    turned = read_out(points, visible, rotations @ turn.T, VIEWS)
+    torch.testing.assert_close(turned, read_out(points, visible, rotations, VIEWS, yaw), atol=1e-4, rtol=0)
+
+
+def test_shape_that_stands_still_in_the_world_stands_still_in_world_views(generator):
+    points, visible, rotations = _clip(generator)
+    still = points[:1] @ rotations[:1] @ rotations.transpose(-1, -2)
+    volume = read_out(still, visible[:1].expand_as(visible), rotations, ReadOut(views=("side", "top")))
+    torch.testing.assert_close(volume, volume[:, :1].expand_as(volume), atol=1e-4, rtol=0)
+
+
+def test_views_show_what_their_axes_say():
+    # One far point up, one to +X, one to +Z of a cluster that holds the centre; camera looks along -Z.
+    points = torch.cat([torch.zeros(20, 3), torch.tensor([[0, 2.0, 0], [2.0, 0, 0], [0, 0, 2.0]])])[None]
+    rotations = _camera(torch.zeros(1))
+    volume = read_out(points @ rotations.transpose(-1, -2), torch.ones(1, 23, dtype=torch.bool), rotations, VIEWS)
+    across, side, top = (picture > 0.03 for picture in volume[:, 0])
+    half = VIEWS.size // 2
+    up = (slice(0, half - 4), slice(half - 2, half + 2))
+    right, left = (slice(half - 2, half + 2), slice(half + 4, None)), (slice(half - 2, half + 2), slice(0, half - 4))
+    down = (slice(half + 4, None), slice(half - 2, half + 2))
+    assert [bool(side[place].any()) for place in (up, right, left, down)] == [True, True, False, False]
+    assert [bool(top[place].any()) for place in (up, right, left, down)] == [False, True, False, True]
+    # +Z is towards this camera, so it lies left in the view whose right is away from the camera.
+    assert [bool(across[place].any()) for place in (up, right, left, down)] == [True, False, True, False]
+
+
+def test_flat_points_do_not_pass_for_a_body(generator):
+    points, visible, rotations = _clip(generator)
+    flat = points * torch.tensor([1.0, 1.0, 0.0])
+    true, without = (read_out(x, visible, rotations, VIEWS) for x in (points, flat))
+    assert (true - without).abs().sum((1, 2, 3)).div(true.sum((1, 2, 3))).gt(0.3).all()
+    # From 90 degrees to the camera nothing is left of the flat shape but a line of the splat's width.
+    assert float((without[0] > 0.05).any(1).sum(-1).float().mean()) < 6
+
+
+def test_own_view_reads_no_depth(generator):
+    points, visible, rotations = _clip(generator)
+    params = ReadOut(views=("camera",), yaws=1)
+    without = points * torch.tensor([1.0, 1.0, 0.0])
+    assert torch.equal(read_out(points, visible, rotations, params), read_out(without, visible, rotations, params))
+
+
+def test_batch_equals_one_by_one(generator):
+    clips = [_clip(generator) for _ in range(3)]
+    batch = read_out(*(torch.stack(parts) for parts in zip(*clips, strict=True)), VIEWS)
+    for volume, clip in zip(batch, clips, strict=True):
+        torch.testing.assert_close(volume, read_out(*clip, VIEWS), atol=1e-5, rtol=0)
+
+
+def test_some_frames_are_a_part_of_all_frames(generator):
+    clip = _clip(generator)
+    part = read_out(*clip, VIEWS, frames=slice(3, 7))
+    torch.testing.assert_close(part, read_out(*clip, VIEWS)[:, 3:7])
+
+
+def test_bad_input_is_named(generator):
+    points, visible, rotations = _clip(generator)
+    visible[2, 5] = True
+    points[2, 5, 1] = torch.nan
+    with pytest.raises(ReconError, match=r"\[2, 5\]"):
+        read_out(points, visible, rotations)
+    with pytest.raises(ReconError, match="nothing is visible"):
+        read_out(points, torch.zeros_like(visible), rotations)
+    with pytest.raises(ReconError, match="views"):
+        ReadOut(views=("front",))
+
+
+def test_overfits_eight_clips(generator):
+    torch.manual_seed(0)
+    params = ReadOut(size=16)
+    clips = [_clip(generator, frames=6) for _ in range(8)]
+    volume = torch.stack([read_out(*clip, params) for clip in clips]).double()
+    label = torch.arange(8) % 4
+    recogniser = Recogniser(("shoot", "run", "jump", "pass"), params, width=8)
+    optimiser = torch.optim.Adam(recogniser.parameters(), lr=5e-3)
+    for _ in range(50):
+        loss = torch.nn.functional.cross_entropy(recogniser(volume), label)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert torch.equal(recogniser(volume).argmax(-1), label)
+
+
+def test_windows_are_those_of_the_clip(generator):
+    recogniser = Recogniser(("shoot", "run", "jump"), ReadOut(yaws=1)).eval()
+    clip = _clip(generator, frames=21)
+    scores = classify_windows(recogniser, *clip, window=8, stride=4)
+    assert scores.probabilities.shape == (4, 3)
+    assert torch.equal(scores.predicted, scores.probabilities.argmax(-1))
+    for index in range(4):
+        volume = read_out(*clip, recogniser.params, frames=slice(4 * index, 4 * index + 8)).double()
+        torch.testing.assert_close(scores.probabilities[index], recogniser(volume).softmax(-1).detach())
+    assert classify_windows(recogniser, *clip, window=32).predicted.shape == (1,)
+
+
+def test_save_and_load_give_the_same_logits_and_hash(tmp_path, generator):
+    torch.set_default_dtype(torch.float32)
+    recogniser = Recogniser(("run", "jump"), ReadOut(views=("side", "top"), size=16), width=8).eval()
+    path = save_recogniser(recogniser, tmp_path / "recogniser.safetensors", {"note": 1})
+    loaded = load_recogniser(path)
+    volume = torch.rand(3, 2, 8, 16, 16, generator=generator)
+    assert torch.equal(loaded(volume), recogniser(volume))
+    assert (loaded.params, loaded.classes) == (recogniser.params, recogniser.classes)
+    known = json.loads(path.with_suffix(".json").read_text())
+    assert known["weights_hash"] == weights_hash(loaded) == weights_hash(recogniser)
+    assert known["note"] == 1
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["recogniser.json", "recogniser.safetensors"]
+    with torch.no_grad():
+        recogniser.to_classes.bias[0] += 1e-6
+    assert weights_hash(recogniser) != known["weights_hash"]
+
+
+def test_what_is_no_recogniser_is_refused(tmp_path):
+    with pytest.raises(ReconError, match="no such file"):
+        load_recogniser(tmp_path / "none.safetensors")
+    (tmp_path / "bad.safetensors").write_bytes(b"no weights")
+    with pytest.raises(ReconError, match="is no recogniser"):
+        load_recogniser(tmp_path / "bad.safetensors")
+    with pytest.raises(ReconError, match="existing folder"):
+        save_recogniser(Recogniser(("run",)), tmp_path / "none" / "a.safetensors")
+
+
+def test_training_job_ends_with_weights_and_does_nothing_twice(tmp_path):
+    out = tmp_path / "recogniser.safetensors"
+    small = ["--data.films=12", "--data.points=80", "--data.validation_films=0", "--data.batch_size=6"]
+    words = ["--out", str(out), *small, "--trainer.max_epochs=1", "--trainer.enable_progress_bar=false"]
+    twice = f"from train.recogniser import main; main({words}); main({words})"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    run = subprocess.run([sys.executable, "-c", twice], cwd=ROOT, capture_output=True, text=True, env=environment)
+    assert run.returncode == 0, run.stderr[-2000:]
+    assert run.stdout.count("wrote") == run.stdout.count("already there") == 1
+    assert load_recogniser(out).classes[:4] == ("shoot", "run", "jump", "pass")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["recogniser.json", "recogniser.safetensors"]

@@ -1,0 +1,217 @@
+"""Training films of the recogniser: true 3D of body surfaces as a camera sees them, made to look like tracks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from torchrecon.data.mocap import MocapClip
+from torchrecon.data.synthetic import (
+    ACTIONS,
+    Body,
+    Camera,
+    Motion,
+    SyntheticClip,
+    retarget_joints,
+    sample_body,
+    sample_motion,
+    static_camera,
+    turning_camera,
+)
+from torchrecon.models.recogniser import ReadOut, hold_last, read_out
+
+WINDOW = 32
+"""Frames that the recogniser looks at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """Surface points of one body in one motion before one camera.
+
+    Attributes:
+        points3d: (frames, points, 3) camera axes, metres.
+        visible: (frames, points) the points that the camera sees.
+        rotations: (frames, 3, 3) world -> camera.
+        label: index of the class.
+    """
+
+    points3d: Tensor
+    visible: Tensor
+    rotations: Tensor
+    label: int
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How a film is varied each time it is shown.
+
+    Attributes:
+        points: fewest and most points that are tracked at all.
+        crowding: spread (log) of how often a region of the body is tracked: texture is uneven.
+        life: shortest and longest life of a track, frames; between lives a point is lost for a third of a life.
+        jitter: largest noise of a coordinate, rms sizes of the clip.
+        offset: largest standing error of a track's depth, rms sizes.
+        depth_scale: largest relative error of the scale of depth.
+        tempo: largest relative change of speed.
+    """
+
+    points: tuple[int, int] = (120, 500)
+    crowding: float = 0.7
+    life: tuple[int, int] = (12, 60)
+    jitter: float = 0.06
+    offset: float = 0.1
+    depth_scale: float = 0.15
+    tempo: float = 0.15
+
+
+AS_TRACKED = Augmentation(points=(300, 301), life=(15, 40), jitter=0.0, offset=0.0, depth_scale=0.0, tempo=0.0)
+"""Exact 3D at the points and times that a tracker would give: what the validity check looks at."""
+
+
+MOCAP_CLASSES = ("shoot", "run", "jump", "pass", "dribble", "walk")
+"""Of real motion; dribble and walk are the distractors."""
+
+
+def synthetic_film(seed: int, points: int, turn: float | None = None) -> Film:
+    """Film number ``seed`` of the synthetic world; the action is ``ACTIONS[seed % 6]``.
+
+    Args:
+        turn: degrees that the camera turns in all; None draws: every third camera stands still.
+    """
+    g = torch.Generator().manual_seed(seed)
+    label = seed % len(ACTIONS)
+    body = sample_body(g)
+    motion = sample_motion(ACTIONS[label], body, generator=g)
+    return film_of(body, motion, label, points, turn, g)
+
+
+def film_of(body: Body, motion: Motion, label: int, points: int, turn: float | None, g: torch.Generator) -> Film:
+    """Surface points of a moving body before a random camera."""
+    draw = torch.rand(3, generator=g).tolist()
+    if turn is None:
+        turn = 0.0 if draw[0] < 1 / 3 else 360 * draw[1]
+    distance = 6 + 2 * draw[2]
+    camera: Camera
+    if turn == 0:
+        camera = static_camera(motion, distance=distance, generator=g)
+    else:
+        camera = turning_camera(motion, total_turn_deg=turn, distance=distance, generator=g)
+    clip = SyntheticClip(body, motion, camera)
+    xyz, seen = clip.trajectory(clip.sample_surface(points, g))
+    ever = seen.any(0)
+    return Film(xyz[:, ever].float(), seen[:, ever], camera.rotations.float(), label)
+
+
+def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Film:
+    """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 6]``."""
+    g = torch.Generator().manual_seed(seed)
+    label = seed % len(MOCAP_CLASSES)
+    of_class = clips[MOCAP_CLASSES[label]]
+    clip = of_class[seed // len(MOCAP_CLASSES) % len(of_class)]
+    body = sample_body(g)
+    motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
+    return film_of(body, motion, label, points, None, g)
+
+
+def make_films(make: Callable[[int], Film], seeds: range, workers: int) -> Iterator[Film]:
+    """``make`` of each seed, in order."""
+    with ProcessPoolExecutor(max(1, workers), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        for points3d, visible, rotations, label in pool.map(partial(_arrays, make), seeds, chunksize=4):
+            yield Film(torch.from_numpy(points3d), torch.from_numpy(visible), torch.from_numpy(rotations), label)
+
+
+def _arrays(make: Callable[[int], Film], seed: int) -> tuple[Any, Any, Any, int]:
+    """Arrays travel between processes by value; tensors would hold a file open for each."""
+    film = make(seed)
+    return film.points3d.numpy(), film.visible.numpy(), film.rotations.numpy(), film.label
+
+
+def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
+    """A variation of the film: fewer points, tracks that are born and die, another tempo, a mirror image, noise."""
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(shape, generator=generator)
+
+    points3d, visible, rotations = _retimed(film, float(uniform(1 - how.tempo, 1 + how.tempo)))
+    frames, count = visible.shape
+
+    middle = points3d[frames // 2]
+    seeds = middle[torch.randint(count, (6,), generator=generator)]
+    region = torch.cdist(middle, seeds).argmin(-1)
+    odds = torch.exp(how.crowding * torch.randn(len(seeds), generator=generator))[region]
+    wanted = min(count, int(uniform(*how.points)))
+    chosen = torch.multinomial(odds, wanted, generator=generator)
+    points3d, visible = points3d[:, chosen], visible[:, chosen]
+
+    life = uniform(*how.life, wanted)
+    clock = torch.arange(frames)[:, None] / (life * 4 / 3) + uniform(0, 1, wanted)
+    alive = visible & (clock.remainder(1.0) < 0.75)
+    visible = torch.where(alive.any(1, keepdim=True), alive, visible)
+
+    if float(uniform(0, 1)) < 0.5:  # the mirror image of body, world and camera together
+        mirror = torch.tensor([-1.0, 1.0, 1.0])
+        points3d, rotations = points3d * mirror, rotations * mirror[:, None] * mirror
+
+    size = _rms_size(points3d, visible)
+    depth = points3d[..., 2:]
+    centre = depth.mean(1, keepdim=True)
+    depth = centre + (depth - centre) * uniform(1 - how.depth_scale, 1 + how.depth_scale)
+    depth = depth + size * uniform(0, how.offset) * torch.randn(wanted, 1, generator=generator)
+    points3d = torch.cat([points3d[..., :2], depth], -1)
+    points3d = points3d + size * uniform(0, how.jitter) * torch.randn(points3d.shape, generator=generator)
+    return Film(points3d, visible, rotations, film.label)
+
+
+def flat(film: Film) -> Film:
+    """The same film with depth unknown: zero in camera axes."""
+    return replace(film, points3d=film.points3d * torch.tensor([1.0, 1.0, 0.0]))
+
+
+def _rms_size(points3d: Tensor, visible: Tensor) -> Tensor:
+    weight = visible[..., None].to(points3d.dtype)
+    centre = (points3d * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
+    return (((points3d - centre).square() * weight).sum() / weight.sum()).sqrt()
+
+
+def _retimed(film: Film, speed: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The film at another speed: points between frames on straight lines, the rest from the nearest frame."""
+    if speed == 1:
+        return film.points3d, film.visible, film.rotations
+    last = len(film.points3d) - 1
+    at = torch.arange(0, last + 1e-6, speed)
+    before = at.floor().long().clamp(max=last - 1)
+    share = (at - before)[:, None, None]
+    nearest = at.round().long()
+    # The camera of the nearest frame belongs to the points of that frame: interpolate them in world axes.
+    world = film.points3d @ film.rotations
+    world = world[before] * (1 - share) + world[before + 1] * share
+    rotations = film.rotations[nearest]
+    return world @ rotations.transpose(-1, -2), film.visible[nearest], rotations
+
+
+class Windows(Dataset[tuple[Tensor, int]]):
+    """One varied window of each film; the same (seed, epoch, index) is the same window."""
+
+    def __init__(self, films: list[Film], params: ReadOut, how: Augmentation, seed: int, epoch: int) -> None:
+        self.films, self.params, self.how, self.seed, self.epoch = films, params, how, seed, epoch
+
+    def __len__(self) -> int:
+        return len(self.films)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, int]:
+        generator = torch.Generator().manual_seed((self.seed * 10_007 + self.epoch) * 1_000_003 + index)
+        film = augment(self.films[index], self.how, generator)
+        yaw = 2 * math.pi * float(torch.rand((), generator=generator))
+        start = int(torch.randint(max(1, len(film.points3d) - WINDOW + 1), (), generator=generator))
+        shown = slice(start, start + WINDOW)
+        return hold_last(
+            read_out(film.points3d, film.visible, film.rotations, self.params, yaw, shown), WINDOW
+        ), film.label

@@ -1,0 +1,307 @@
+"""Train the recogniser of Table 1 on the true 3D of training bodies: ``python -m train.recogniser``.
+
+One command makes the films, trains, checks that the recogniser tells 3D from its absence, and writes the weights:
+
+    python -m train.recogniser                                            runs/recogniser/recogniser.safetensors
+    python -m train.recogniser --views 2d                                 runs/recogniser/recogniser_2d.safetensors
+    python -m train.recogniser --data FILE.npz --exclude A,B --out OUT    real motion, without subjects A and B
+
+``--views 2d`` sees what needs no 3D at all: the camera's own view. A stopped run goes on where it was; weights that
+these settings have already made are left alone (``--force`` makes them again). Settings: configs/recogniser.yaml, each
+of which is also a flag (``--help``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import platform
+import shutil
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from torch import Tensor
+from torch.nn import functional as F
+from torch.utils.data import DataLoader, WeightedRandomSampler
+from tqdm import tqdm
+
+import torchrecon
+from torchrecon.data.mocap import MocapClip, load_mocap
+from torchrecon.data.synthetic import ACTIONS
+from torchrecon.errors import ReconError
+from torchrecon.models.recogniser import ReadOut, Recogniser, classify_windows, save_recogniser
+from train.films import (
+    AS_TRACKED,
+    MOCAP_CLASSES,
+    Augmentation,
+    Film,
+    Windows,
+    augment,
+    flat,
+    make_films,
+    mocap_film,
+    synthetic_film,
+)
+
+CONFIG = Path(__file__).parents[1] / "configs" / "recogniser.yaml"
+TRUE_AT_MOST, FLAT_AT_LEAST = 3.0, 25.0
+"""Per cent of windows named wrongly, with which the protocol of Table 1 is valid."""
+
+
+class Films(L.LightningDataModule):
+    """The films of the training and of the validity check.
+
+    Args:
+        augmentation: how each film is varied.
+        file: mocap archive (.npz) whose clips drive the bodies; None = the synthetic world.
+        exclude: with ``file``: subjects that must not be seen.
+        films: number of training films.
+        points: surface points of a film.
+        train_seeds, validation_seeds: seed of the first film, divisible by 6; the others follow.
+        validation_films: films of the validity check (synthetic world only).
+        workers: processes that prepare films.
+    """
+
+    def __init__(
+        self,
+        augmentation: Augmentation,
+        file: str | None = None,
+        exclude: list[str] | None = None,
+        films: int = 720,
+        points: int = 500,
+        train_seeds: int = 1_000_000,
+        validation_seeds: int = 2_000_000,
+        validation_films: int = 120,
+        batch_size: int = 32,
+        workers: int = 2,
+    ) -> None:
+        super().__init__()
+        self.augmentation, self.file, self.exclude = augmentation, file, exclude or []
+        self.films, self.points = films, points
+        self.train_seeds, self.validation_seeds, self.validation_films = train_seeds, validation_seeds, validation_films
+        self.batch_size, self.workers = batch_size, workers
+        self.classes = ACTIONS if file is None else MOCAP_CLASSES
+        self.training: list[Film] = []
+
+    def setup(self, stage: str) -> None:
+        if not self.training:
+            seeds = range(self.train_seeds, self.train_seeds + self.films)
+            made = make_films(self._maker(), seeds, self.workers)
+            self.training = list(tqdm(made, "training films", self.films, unit="film"))
+
+    def _maker(self) -> Callable[[int], Film]:
+        if self.file is None:
+            return partial(synthetic_film, points=self.points)
+        clips: dict[str, list[MocapClip]] = {name: [] for name in MOCAP_CLASSES}
+        known = load_mocap(self.file, MOCAP_CLASSES)
+        strange = set(self.exclude) - {clip.subject for clip in known}
+        if strange:
+            raise ReconError(f"{self.file}: has no subject {sorted(strange)[0]!r}; exclude names subjects of the file")
+        for clip in known:
+            if clip.subject not in self.exclude and len(clip) >= clip.fps:
+                clips[clip.label].append(clip)
+        empty = [name for name, of_class in clips.items() if not of_class]
+        if empty:
+            raise ReconError(f"{self.file}: no clip of {', '.join(empty)} of 1 s or more is left to train on")
+        return partial(mocap_film, clips=clips, points=self.points)
+
+    def validation(self, turn: float, what: str) -> list[Film]:
+        """Films of other bodies and motions, before a camera that turns by ``turn`` degrees."""
+        seeds = range(self.validation_seeds, self.validation_seeds + self.validation_films)
+        made = make_films(partial(synthetic_film, points=self.points, turn=turn), seeds, self.workers)
+        return list(tqdm(made, what, self.validation_films, unit="film"))
+
+    def train_dataloader(self) -> DataLoader[tuple[Tensor, Tensor]]:
+        """One varied window per film; rare classes are drawn as often as the others. A new one for every epoch."""
+        epoch = self.trainer.current_epoch
+        params = self.trainer.lightning_module.recogniser.params
+        labels = torch.tensor([film.label for film in self.training])
+        odds = 1.0 / torch.bincount(labels)[labels]
+        generator = torch.Generator().manual_seed(epoch)
+        return DataLoader(
+            Windows(self.training, params, self.augmentation, self.train_seeds, epoch),
+            batch_size=self.batch_size,
+            sampler=WeightedRandomSampler(odds, len(labels), generator=generator),
+            num_workers=self.workers,
+            drop_last=len(labels) > self.batch_size,
+        )
+
+
+class Training(L.LightningModule):
+    """What is optimised and how.
+
+    Args:
+        width: channels of the first layer.
+        learning_rate: peak of the one-cycle schedule.
+        weight_decay: of AdamW.
+    """
+
+    def __init__(
+        self,
+        classes: tuple[str, ...],
+        read_out: ReadOut,
+        width: int = 16,
+        learning_rate: float = 3e-3,
+        weight_decay: float = 1e-2,
+    ) -> None:
+        super().__init__()
+        self.recogniser = Recogniser(classes, read_out, width)
+        self.learning_rate, self.weight_decay = learning_rate, weight_decay
+
+    def training_step(self, batch: tuple[Tensor, Tensor], index: int) -> Tensor:
+        volume, label = batch
+        logits = self.recogniser(volume)
+        loss = F.cross_entropy(logits, label, label_smoothing=0.05)
+        wrong = (logits.argmax(-1) != label).float().mean()
+        self.log_dict({"loss": loss, "wrong": wrong}, prog_bar=True, on_step=False, on_epoch=True)
+        return loss
+
+    def configure_optimizers(self) -> Any:
+        optimiser = torch.optim.AdamW(self.parameters(), lr=self.learning_rate, weight_decay=self.weight_decay)
+        steps = int(self.trainer.estimated_stepping_batches)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, self.learning_rate, total_steps=steps, pct_start=0.2)
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class Command(LightningCLI):
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_argument("--out", type=str | None, default=None, help="weights file (.safetensors)")
+        parser.add_argument("--force", action="store_true", help="train again what is already there")
+        parser.link_arguments("data.classes", "model.classes", apply_on="instantiate")
+
+
+def error_rates(recogniser: Recogniser, films: list[Film]) -> dict[str, float]:
+    """Per cent of windows named wrongly, by action and over the four actions of the paper ("mean")."""
+    wrong: dict[str, list[float]] = {}
+    for film in films:
+        scores = classify_windows(recogniser, film.points3d, film.visible, film.rotations)
+        name = recogniser.classes[film.label]
+        wrong.setdefault(name, []).extend((scores.predicted != film.label).double().tolist())
+    rates = {name: 100 * sum(values) / len(values) for name, values in wrong.items()}
+    asked = [rates[name] for name in ("shoot", "run", "jump", "pass") if name in rates]
+    return {**rates, "mean": sum(asked) / len(asked)}
+
+
+def validity(recogniser: Recogniser, films: list[Film]) -> dict[str, Any]:
+    """The error on true 3D and on the same points without depth, on bodies that were not trained on."""
+    seen = [augment(film, AS_TRACKED, torch.Generator().manual_seed(index)) for index, film in enumerate(films)]
+    true, without = error_rates(recogniser, seen), error_rates(recogniser, [flat(film) for film in seen])
+    return {
+        "true_3d": true,
+        "flat": without,
+        "valid": true["mean"] <= TRUE_AT_MOST and without["mean"] >= FLAT_AT_LEAST,
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    started = time.time()
+    torch.set_num_threads(1)  # the other processes prepare films; and the sum's order does not depend on the machine
+    for harmless in ("does not have many workers", "args parameter is intended to run", "isinstance.treespec"):
+        warnings.filterwarnings("ignore", f".*{harmless}")
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    command = Command(
+        Training,
+        Films,
+        run=False,
+        save_config_callback=None,
+        args=_plain(sys.argv[1:] if arguments is None else arguments),
+        parser_kwargs={"default_config_files": [str(CONFIG)]},
+        trainer_defaults={"logger": False, "deterministic": True, "reload_dataloaders_every_n_epochs": 1},
+    )
+    settings = _settings(command)
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    params = command.model.recogniser.params
+    out = Path(
+        command.config.out or f"runs/recogniser/recogniser{'_2d' if params.views == ('camera',) else ''}.safetensors"
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if not command.config.force and _made_by(out) == digest:
+        print(f"{out} is already there, made with these settings (--force makes it again)")
+        return 0
+
+    half_way = out.with_suffix(f".{digest[:12]}")
+    callbacks = [item for item in command.trainer.callbacks if not isinstance(item, ModelCheckpoint)]
+    command.trainer.callbacks = [*callbacks, ModelCheckpoint(half_way, save_last=True, save_top_k=0)]
+    last = half_way / "last.ckpt"
+    command.trainer.fit(command.model, command.datamodule, ckpt_path=last if last.exists() else None)
+    recogniser = command.model.recogniser.eval()
+
+    report: dict[str, Any] = {"settings": settings, "settings_hash": digest, **_origin()}
+    data = command.datamodule
+    if data.validation_films and data.file is None:
+        print("the validity check: true 3D, and the same points without depth, of bodies not trained on", flush=True)
+        for name, turn in (("turning", 300.0), ("static", 0.0)):
+            report[name] = validity(recogniser, data.validation(turn, f"{name} camera"))
+            for row in ("true_3d", "flat"):
+                print(f"  {row:8s}", "  ".join(f"{key} {value:.1f} %" for key, value in report[name][row].items()))
+    report["seconds"] = time.time() - started
+    save_recogniser(recogniser, out, report)
+    shutil.rmtree(half_way)
+    print(f"wrote {out} after {report['seconds']:.0f} s")
+    return 0
+
+
+def _plain(arguments: list[str]) -> list[str]:
+    """The job's own short flags in LightningCLI's words."""
+    words: list[str] = []
+    rest = iter(arguments)
+    for word in rest:
+        name, _, value = word.partition("=")
+        if name not in ("--views", "--data", "--exclude"):
+            words.append(word)
+            continue
+        value = value or next(rest, "")
+        if name == "--views":
+            if value not in ("2d", "3d"):
+                sys.exit(f"--views {value}: must be 2d or 3d")
+            if value == "2d":
+                words += ["--model.read_out.views", "[camera]", "--model.read_out.yaws", "1"]
+        else:
+            words += ["--data.file", value] if name == "--data" else ["--data.exclude", json.dumps(value.split(","))]
+    return words
+
+
+def _settings(command: Command) -> dict[str, Any]:
+    """What decides the weights: not who prepares the films or where the weights go."""
+    config = json.loads(command.parser.dump(command.config, format="json"))
+    data = {key: value for key, value in config["data"].items() if key != "workers"}
+    if data.get("file"):
+        data["file"] = hashlib.sha256(Path(data["file"]).read_bytes()).hexdigest()
+    epochs = config["trainer"]["max_epochs"]
+    return {"model": config["model"], "data": data, "epochs": epochs, "seed": config["seed_everything"]}
+
+
+def _origin() -> dict[str, str]:
+    """Which code on which machine."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=CONFIG.parent, capture_output=True, text=True, check=False
+    )
+    return {
+        "commit": commit.stdout.strip() or "unknown",
+        "torchrecon": torchrecon.__version__,
+        "torch": torch.__version__,
+        "lightning": L.__version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+    }
+
+
+def _made_by(out: Path) -> str | None:
+    """The settings of the weights that are already there."""
+    report = out.with_suffix(".json")
+    return json.loads(report.read_text()).get("settings_hash") if out.is_file() and report.is_file() else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
