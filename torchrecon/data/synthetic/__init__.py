@@ -14,6 +14,7 @@ from torchrecon.data.synthetic.cameras import (
 from torchrecon.data.synthetic.clip import SurfacePoints, SyntheticClip
 from torchrecon.data.synthetic.motion import ACTIONS, Motion, sample_motion
 from torchrecon.data.synthetic.renderer import SensorNoise, SyntheticFrame
+from torchrecon.data.synthetic.retarget import retarget_joints
 
 __all__ = [
     "ACTIONS",
@@ -28,6 +29,7 @@ __all__ = [
     "SyntheticFrame",
     "handheld_camera",
     "panning_camera",
+    "retarget_joints",
     "sample_body",
     "sample_motion",
     "static_camera",

@@ -62,8 +62,8 @@ def smooth_noise(
     """Band-limited random sway, standard deviation about 1: five sines up to ``frequency`` hertz."""
     rate = frequency * (0.2 + 0.8 * torch.rand(channels, 5, generator=generator, dtype=torch.float64))
     phase = 2 * torch.pi * torch.rand(channels, 5, generator=generator, dtype=torch.float64)
-    wave = torch.sin(2 * torch.pi * rate * t.double()[:, None, None] + phase)
-    return (wave.sum(-1) * (2 / 5) ** 0.5).to(t.dtype)
+    wave: Tensor = torch.sin(2 * torch.pi * rate * t.double()[:, None, None] + phase).sum(-1)
+    return wave.mul((2 / 5) ** 0.5).to(t.dtype)
 
 
 def upper_envelope(x: Float[Tensor, " frames"], radius: int) -> Float[Tensor, " frames"]:
