@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -15,6 +15,7 @@ from torchrecon.measurement.tracks import Tracks
 __all__ = ["GapFiller", "RankRule", "Solver"]
 
 
+@runtime_checkable
 class Solver(Protocol):
     """From tracks and a number of shape bases to 3D: every file in ``torchrecon.nrsfm`` offers one."""
 
@@ -23,12 +24,14 @@ class Solver(Protocol):
     ) -> Reconstruction: ...
 
 
+@runtime_checkable
 class RankRule(Protocol):
     """From tracks to the number of shape bases: every file in ``torchrecon.rank`` offers one."""
 
     def __call__(self, tracks: Tracks) -> RankEstimate: ...
 
 
+@runtime_checkable
 class GapFiller(Protocol):
     """From tracks with gaps to a value and a covariance for every entry: every file in ``torchrecon.gaps``."""
 
