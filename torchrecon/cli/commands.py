@@ -107,7 +107,7 @@ def _with_camera(tracks: Tracks, path: str) -> Tracks:
 
     from torchrecon.io.frames import load_camera
 
-    return replace(tracks, intrinsics=load_camera(path))
+    return replace(tracks, intrinsics=load_camera(path).intrinsics)
 
 
 def _rank(text: str) -> Any:
