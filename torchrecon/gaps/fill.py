@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 
@@ -34,9 +33,7 @@ class GapParams:
     low_rank: LowRankParams = field(default_factory=LowRankParams)
 
 
-def fill_gaps(
-    tracks: Tracks, method: Literal["auto", "abg", "rts", "low_rank"] = "auto", params: GapParams | None = None
-) -> FilledTracks:
+def fill_gaps(tracks: Tracks, method: str = "auto", params: GapParams | None = None) -> FilledTracks:
     """Estimate the entries that were not seen.
 
     Filled values are estimates for methods that need complete matrices, for gating and for drawing; counted as

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import torch
 
@@ -40,8 +39,8 @@ _MOST = 10
 def estimate_rank(
     tracks: Tracks,
     rule: str = "auto",
-    layout: Literal["vector", "stack"] | None = None,
-    noise_scale: Literal["estimate", "given"] = "estimate",
+    layout: str | None = None,
+    noise_scale: str = "estimate",
     max_rank: int | None = None,
     generator: torch.Generator | None = None,
 ) -> RankEstimate:

@@ -1,0 +1,294 @@
+"""Eqs. 18-20 and 25-27: the number of shape bases."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import scipy.integrate
+import torch
+
+from torchrecon.errors import ReconError
+from torchrecon.linalg.noise_edge import complement_basis, count_signals, spectrum, tracy_widom_edge
+from torchrecon.measurement import Tracks, stack_matrix, vector_matrix
+from torchrecon.rank import cross_validate, estimate_rank
+
+
+def _smooth(frames: int, count: int, cycles: int, g: torch.Generator) -> torch.Tensor:
+    """Band-limited random curves of unit variance, (count, frames)."""
+    t = torch.arange(frames) / frames
+    k = torch.arange(cycles + 1)
+    amplitude = torch.randn(count, cycles + 1, 1, generator=g)
+    phase = 2 * math.pi * torch.rand(count, cycles + 1, 1, generator=g)
+    x = (amplitude * torch.cos(2 * math.pi * k[:, None] * t + phase)).sum(1)
+    x = x - x.mean(1, keepdim=True)
+    return x / x.std(1, keepdim=True)
+
+
+def _rotations(vectors: torch.Tensor) -> torch.Tensor:
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(*x.shape, 3, 3)
+    return torch.linalg.matrix_exp(cross)
+
+
+def _scene(
+    frames: int,
+    points: int,
+    bases: int,
+    snr: float,
+    seed: int,
+    motion: str = "generic",
+    frame_spread: float = 0.0,
+    missing: float = 0.0,
+) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Orthographic tracks of a body with ``bases`` shape bases: xy, visible, noise standard deviation."""
+    g = torch.Generator().manual_seed(seed)
+    shapes = torch.randn(bases, 3, points, generator=g)
+    shapes = shapes - shapes.mean(-1, keepdim=True)
+    weights = torch.cat(
+        [1 + 0.2 * _smooth(frames, 1, 4, g)] + [0.5 * 0.8**k * _smooth(frames, 1, 4, g) for k in range(1, bases)]
+    )
+    if motion == "generic":
+        turn = 1.2 * _smooth(frames, 3, 3, g).T
+    else:
+        angle = 2 * math.pi * torch.arange(frames) / frames * (motion == "yaw")
+        turn = torch.stack([0 * angle, angle, 0 * angle], -1)
+    body = torch.einsum("kf,kap->fap", weights, shapes)
+    xy = 30 * (_rotations(turn) @ body)[:, :2].transpose(1, 2)
+    sigma = float(xy.pow(2).mean().sqrt()) * 10 ** (-snr / 20)
+    level = torch.exp(frame_spread * torch.randn(frames, 1, 1, generator=g))
+    noise = sigma * level / level.pow(2).mean().sqrt() * torch.randn(frames, points, 2, generator=g)
+    visible = torch.ones(frames, points, dtype=torch.bool)
+    while float((~visible).double().mean()) < missing:
+        p, start, length = (int(torch.randint(high, (1,), generator=g)) for high in (points, frames, 13))
+        visible[start : start + length + 3, p] = False
+    return xy + noise + 40 * _smooth(frames, 2, 2, g).T[:, None] + 300, visible, sigma
+
+
+def _isotropic(xy: torch.Tensor, sigma: float) -> torch.Tensor:
+    return sigma**2 * torch.eye(2).expand(*xy.shape, 2)
+
+
+def test_eq18_19_vectors_have_rank_6k_and_the_stack_3k() -> None:
+    for bases in (1, 2, 4):
+        xy, _, _ = _scene(200, 40, bases, 400.0, 0)
+        centred = xy - xy.mean(1, keepdim=True)
+        for matrix, per_basis in ((vector_matrix(centred), 6), (stack_matrix(centred), 3)):
+            values = torch.linalg.svdvals(matrix)
+            assert int((values > 1e-9 * values[0]).sum()) == per_basis * bases
+    xy, _, _ = _scene(200, 40, 2, 400.0, 0, motion="yaw")
+    values = torch.linalg.svdvals(vector_matrix(xy - xy.mean(1, keepdim=True)))
+    assert int((values > 1e-9 * values[0]).sum()) == 6  # 3K, not 6K: why the paper's division by 6 is conditional
+
+
+def test_eq20_second_moments_are_signal_plus_noise_covariance() -> None:
+    clean = 0.05 * _scene(20, 10, 2, 400.0, 0)[0]
+    g = torch.Generator().manual_seed(1)
+    factor = torch.randn(10, 2, 2, generator=g)
+    noise = torch.einsum("pab,nfpb->nfpa", factor, torch.randn(4000, 20, 10, 2, generator=g))
+    noisy = vector_matrix((clean - clean.mean((0, 1))) + noise)
+    measured = noisy.transpose(-1, -2) @ noisy / 20
+    c = factor @ factor.transpose(-1, -2)
+    dense = torch.cat(
+        [torch.cat([torch.diag(c[:, a, b]) for b in (0, 1)], 1) for a in (0, 1)],
+        0,
+    )
+    signal = vector_matrix(clean - clean.mean((0, 1)))
+    expected = signal.T @ signal / 20 + dense
+    assert float((measured.mean(0) - expected).norm() / dense.norm()) < 0.05
+
+
+def test_eq25_26_whitened_eigenvalues_do_not_depend_on_how_the_points_are_scaled() -> None:
+    xy, _, sigma = _scene(150, 20, 2, 20.0, 0)
+    g = torch.Generator().manual_seed(0)
+    mixed = torch.randn(20, 2, 2, generator=g) + 2 * torch.eye(2)
+    covariance = sigma**2 * mixed @ mixed.transpose(-1, -2)
+    tracks = Tracks(xy, covariance=covariance.expand(150, 20, 2, 2))
+    estimate = estimate_rank(tracks, "tracy_widom", layout="vector", noise_scale="given")
+    # the printed order: centre with Helmert rows, then C -> T C T^T, then the eigenvalues of R C^-1
+    t = complement_basis(torch.ones(20)).T
+    helmert = torch.block_diag(t, t)
+    c = torch.cat([torch.cat([torch.diag(covariance[:, a, b]) for b in (0, 1)], 1) for a in (0, 1)], 0)
+    x = vector_matrix(xy) @ helmert.T
+    h = (x.T @ x / 150) @ torch.linalg.inv(helmert @ c @ helmert.T)
+    values = torch.linalg.eigvals(h)
+    assert float(values.imag.abs().max()) < 1e-6
+    torch.testing.assert_close(estimate.eigenvalues, values.real.sort(descending=True).values)
+
+
+def _mass_above(level: float, ratio: float) -> float:
+    low, high = (1 - ratio**0.5) ** 2, (1 + ratio**0.5) ** 2
+
+    def density(x: float) -> float:
+        return math.sqrt(max((high - x) * (x - low), 0.0)) / (2 * math.pi * ratio * x)
+
+    return float(scipy.integrate.quad(density, level, high)[0])
+
+
+@pytest.mark.parametrize(("frames", "points", "bases"), [(1000, 60, 2), (300, 30, 3), (1000, 100, 1), (300, 60, 2)])
+def test_eq27_paper_rule_follows_its_closed_form(frames: int, points: int, bases: int) -> None:
+    counts = []
+    for seed in range(8):
+        xy, _, sigma = _scene(frames, points, bases, 30.0, seed)
+        estimate = estimate_rank(Tracks(xy, covariance=_isotropic(xy, sigma)), "paper")
+        assert (estimate.rule, estimate.layout) == ("paper", "vector")
+        counts.append(6 * float(estimate.deformation_degree))
+        assert (estimate.threshold == 1).all()
+        assert estimate.rank == int(float(estimate.deformation_degree) + 0.5)
+    measured = sum(counts) / len(counts)
+    free, left = 2 * points - 2 - 6 * bases, frames - 6 * bases
+    # the signals take 6K samples with them, but the paper divides by all F: the level 1 lies F / (F - 6K) higher
+    assert measured == pytest.approx(6 * bases + free * _mass_above(frames / left, free / left), rel=0.03)
+    if frames == 1000:
+        plain = 6 * bases + free * _mass_above(1.0, (2 * points - 2) / frames)
+        assert measured == pytest.approx(plain, rel=0.03)
+    assert measured > 1.5 * 6 * bases
+
+
+def test_eq27_paper_needs_a_covariance() -> None:
+    xy, _, _ = _scene(30, 20, 1, 30.0, 0)
+    with pytest.raises(ReconError, match="covariance"):
+        estimate_rank(Tracks(xy), "paper")
+    with pytest.raises(ReconError, match="covariance"):
+        estimate_rank(Tracks(xy), noise_scale="given")
+
+
+def test_eq27_exact_k_at_20_db() -> None:
+    cells = [(f, p, k, s) for f in (100, 200) for p in (60, 80) for k in (1, 2, 3, 4) for s in (0, 1)]
+    exact = [estimate_rank(Tracks(_scene(f, p, k, 20.0, s)[0])).rank == k for f, p, k, s in cells]
+    assert sum(exact) >= 0.95 * len(cells)
+
+
+def test_eq27_noise_that_varies_per_frame() -> None:
+    exact = [
+        estimate_rank(Tracks(_scene(100, 60, k, 20.0, s, frame_spread=0.7)[0])).rank == k
+        for k in (1, 2, 3, 4)
+        for s in range(4)
+    ]
+    assert sum(exact) >= 15
+
+
+@pytest.mark.parametrize("missing", [0.05, 0.1])
+def test_eq27_exact_k_with_gaps(missing: float) -> None:
+    exact = []
+    for bases in (1, 2, 3, 4):
+        for seed in range(3):
+            xy, visible, _ = _scene(100, 60, bases, 20.0, seed, missing=missing)
+            estimate = estimate_rank(Tracks(xy, visible))
+            exact.append(estimate.rank == bases)
+            assert estimate.interval[0] <= estimate.rank <= estimate.interval[1]
+    assert sum(exact) >= 11
+
+
+def test_band_shaped_visibility_where_no_point_is_complete() -> None:
+    xy, visible, _ = _scene(60, 300, 3, 30.0, 0)
+    g = torch.Generator().manual_seed(0)
+    start = torch.randint(-10, 50, (300,), generator=g)
+    length = torch.randint(15, 40, (300,), generator=g)
+    frame = torch.arange(60)[:, None]
+    visible = (frame >= start) & (frame < start + length)
+    seen = visible.sum(0) > 8
+    estimate = estimate_rank(Tracks(xy[:, seen], visible[:, seen]))
+    assert not visible.all(0).any()
+    assert (estimate.rule, estimate.rank) == ("cross_validation", 3)
+
+
+def test_pure_noise_on_a_rigid_body_is_k_1() -> None:
+    ranks = [estimate_rank(Tracks(_scene(80, 40, 1, 10.0, s)[0])).rank for s in range(40)]
+    assert sum(rank == 1 for rank in ranks) >= 39
+
+
+def test_noise_alone_has_no_signal() -> None:
+    g = torch.Generator().manual_seed(0)
+    counts = []
+    for _ in range(200):
+        values, samples, _ = spectrum(torch.randn(90, 25, generator=g))
+        counts.append(count_signals(values, samples, 1.0)[0])
+    assert 0.90 <= sum(c == 0 for c in counts) / 200 <= 0.99
+    assert tracy_widom_edge(90, 25) > (90**0.5 + 25**0.5) ** 2 / 90
+
+
+def test_yaw_only_swing_and_static_views() -> None:
+    for bases in (1, 3):
+        estimate = estimate_rank(Tracks(_scene(150, 40, bases, 20.0, 0, motion="yaw")[0]))
+        assert estimate.rank == bases
+        assert estimate.warnings == ()
+        still = estimate_rank(Tracks(_scene(150, 40, bases, 20.0, 0, motion="static")[0]))
+        assert any("depth" in text for text in still.warnings)
+    assert estimate_rank(Tracks(_scene(150, 40, 3, 30.0, 0)[0])).warnings == ()
+
+
+def test_fewer_frames_than_coordinates() -> None:
+    for bases in (1, 2, 3):
+        assert estimate_rank(Tracks(_scene(30, 60, bases, 30.0, 1)[0])).rank == bases
+
+
+def test_scale_rotation_and_precision_do_not_matter() -> None:
+    xy, _, _ = _scene(100, 60, 3, 20.0, 5)
+    reference = estimate_rank(Tracks(xy))
+    turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
+    for other in (7.5 * xy, xy @ turn.T, xy.float(), xy[:, torch.randperm(60)]):
+        estimate = estimate_rank(Tracks(other))
+        assert estimate.rank == reference.rank
+        torch.testing.assert_close(
+            (estimate.eigenvalues / estimate.threshold).double(),
+            reference.eigenvalues / reference.threshold,
+            rtol=1e-3,
+            atol=1e-3,
+        )
+
+
+@pytest.mark.parametrize("rule", ["mp", "tracy_widom", "kritchman_nadler", "mdl", "cross_validation"])
+def test_every_rule_finds_a_clear_answer_and_keeps_the_contract(rule: str) -> None:
+    xy, _, sigma = _scene(200, 60, 3, 30.0, 0)
+    tracks = Tracks(xy, covariance=_isotropic(xy, sigma))
+    estimate = estimate_rank(tracks, rule)
+    assert (estimate.rank, estimate.rule, estimate.layout) == (3, rule, "stack")
+    assert estimate.eigenvalues.shape == estimate.threshold.shape
+    assert (estimate.eigenvalues.diff() <= 0).all()
+    assert estimate_rank(tracks, rule, max_rank=2).rank <= 2
+    if rule in ("mp", "tracy_widom"):
+        assert estimate_rank(tracks, rule, noise_scale="given").rank == 3
+
+
+def test_unequal_points_need_the_covariance() -> None:
+    xy, _, sigma = _scene(200, 60, 2, 20.0, 0)
+    g = torch.Generator().manual_seed(0)
+    level = torch.exp(0.8 * torch.randn(60, generator=g))
+    noisy = xy + sigma * level[:, None] * torch.randn(200, 60, 2, generator=g)
+    covariance = (sigma**2 * (1 + level**2))[:, None, None] * torch.eye(2)
+    told = estimate_rank(Tracks(noisy, covariance=covariance.expand(200, 60, 2, 2)), "tracy_widom", noise_scale="given")
+    blind = estimate_rank(Tracks(noisy), "tracy_widom")
+    assert told.rank == 2
+    assert blind.rank > 2
+    assert estimate_rank(Tracks(noisy)).rank == 2  # the residuals tell what the covariance would have told
+
+
+def test_batches_incomplete_points_and_bad_arguments() -> None:
+    scenes = [_scene(80, 40, k, 30.0, k)[0] for k in (1, 3)]
+    batch = estimate_rank(Tracks(torch.stack(scenes)))
+    assert batch.rank.tolist() == [1, 3]
+    assert batch.rank.dtype == torch.int64
+    assert batch.interval.shape == (2, 2)
+    xy, visible, _ = _scene(80, 40, 2, 30.0, 0)
+    visible[5, :4] = False
+    some = estimate_rank(Tracks(xy, visible), "kritchman_nadler")
+    assert some.rank == 2
+    assert any("4 of 40" in text for text in some.warnings)
+    tiny = estimate_rank(Tracks(torch.rand(5, 2, 2)))
+    assert tiny.rank == 1
+    assert tiny.warnings
+    for bad in ({"rule": "best"}, {"layout": "rows"}, {"noise_scale": "guess"}, {"max_rank": 0}):
+        with pytest.raises(ReconError, match=next(iter(bad))):
+            estimate_rank(Tracks(xy), **bad)
+
+
+def test_unseen_entries_are_never_read_and_seeds_decide() -> None:
+    xy, visible, _ = _scene(60, 40, 2, 20.0, 0, missing=0.1)
+    results = []
+    for fill in (0.0, 1e6, float("nan")):
+        poisoned = torch.where(visible[..., None], xy, torch.tensor(fill))
+        results.append(cross_validate(poisoned, visible, 4, torch.Generator().manual_seed(3)).errors)
+    assert results[0] == results[1] == results[2]
+    assert cross_validate(xy, visible, 4, torch.Generator().manual_seed(4)).errors != results[0]
