@@ -48,7 +48,6 @@ class SyntheticClip:
         body, motion, camera: see ``sample_body``, ``sample_motion``, ``turning_camera``.
         seed: of hall and sensor noise.
         sensor_noise: None renders clean colours and exact depth.
-        supersample: colour samples per pixel and axis.
 
     Example:
         >>> import torch
@@ -69,14 +68,13 @@ class SyntheticClip:
         camera: Camera,
         seed: int = 0,
         sensor_noise: SensorNoise | None = None,
-        supersample: int = 2,
     ) -> None:
         if len(motion) != camera.rotations.shape[0]:
             raise ReconError(
                 f"motion has {len(motion)} frames, camera {camera.rotations.shape[0]}; make the camera from this motion"
             )
         self.body, self.motion, self.camera = body, motion, camera
-        self.seed, self.sensor_noise, self.supersample = seed, sensor_noise, supersample
+        self.seed, self.sensor_noise = seed, sensor_noise
 
     def __len__(self) -> int:
         return len(self.motion)
@@ -135,7 +133,7 @@ class SyntheticClip:
 
     def render(self, index: int) -> SyntheticFrame:
         """Render one frame (0-based); about 0.1 s of CPU at 768 x 576."""
-        frame = render_frame(self._scene_at(index), self.camera, index, self._textures, self._court, self.supersample)
+        frame = render_frame(self._scene_at(index), self.camera, index, self._textures, self._court)
         if self.sensor_noise is None:
             return frame
         generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + index)

@@ -57,16 +57,18 @@ class SyntheticFrame:
 
 
 def render_frame(
-    scene: RoundCones, camera: Camera, index: int, textures: list[SolidTexture], court: Court, supersample: int
+    scene: RoundCones, camera: Camera, index: int, textures: list[SolidTexture], court: Court
 ) -> SyntheticFrame:
     """Clean colours, exact depth and mask of one frame.
+
+    The body is cast on a grid of half-pixel steps. Colours are weighted 1-2-1 across it in both directions, which
+    suppresses what a pixel cannot resolve; depth and mask are those of the pixel's centre.
 
     Args:
         scene: parts in camera axes, the ball last.
         camera, index: which view.
         textures: one for each part of the scene.
         court: what lies behind.
-        supersample: colour samples per pixel and axis; depth and mask are taken at the pixel's centre.
     """
     boxes = _boxes(scene, camera, index)
     scene = RoundCones(
@@ -74,25 +76,30 @@ def render_frame(
     )
     origin_map, direction_map = (m.float() for m in camera.ray_maps(index))
     rotation, translation = camera.rotations[index].float(), camera.translations[index].float()
-    depth, part = cast_image(scene, origin_map, direction_map, boxes, camera.size)
-    rgb, behind = _background(court, camera.size, origin_map, direction_map, rotation, translation)
+    rgb, depth = _background(court, camera.size, origin_map, direction_map, rotation, translation)
+    mask = torch.zeros(camera.size, dtype=torch.bool)
     filled = boxes[boxes[:, 2] > boxes[:, 0]]
-    if len(filled):
-        left, top = filled[:, :2].amin(0).tolist()
-        right, bottom = filled[:, 2:].amax(0).tolist()
-        n = supersample
-        # Pixel (i, j) of the fine grid is the place left + (i - (n - 1) / 2) / n of the image.
-        fine = torch.tensor([[1 / n, 0, left - (n - 1) / (2 * n)], [0, 1 / n, top - (n - 1) / (2 * n)], [0, 0, 1]])
-        fine = fine.to(origin_map)
-        inner = (boxes - torch.tensor([left, top, left, top])) * n
-        colour, cover = _colour(
-            scene, textures, rotation, origin_map @ fine, direction_map @ fine, inner,
-            ((bottom - top) * n, (right - left) * n),
-        )  # fmt: skip
-        window = rgb[:, top:bottom, left:right]
-        window.mul_(1 - F.avg_pool2d(cover, n)[0]).add_(F.avg_pool2d(colour, n)[0])
-    mask = (part >= 0) & (part < len(textures) - 1)
-    return SyntheticFrame(rgb, torch.where(depth.isfinite(), depth, behind), mask)
+    if not len(filled):
+        return SyntheticFrame(rgb, depth, mask)
+    left, top = filled[:, :2].amin(0).tolist()
+    right, bottom = filled[:, 2:].amax(0).tolist()
+    # Place (i, j) of the fine grid is the pixel (left + (i - 1) / 2, top + (j - 1) / 2) of the image.
+    fine = torch.tensor([[0.5, 0.0, left - 0.5], [0.0, 0.5, top - 0.5], [0.0, 0.0, 1.0]]).to(origin_map)
+    inner = (boxes - torch.tensor([left, top, left, top])) * 2
+    inner[:, 2:] += (inner[:, 2:] > inner[:, :2]).long()
+    size = (2 * (bottom - top) + 1, 2 * (right - left) + 1)
+    maps = (origin_map @ fine, direction_map @ fine)
+    z, part = cast_image(scene, *maps, inner, size)
+    shaded = _shade(scene, textures, rotation, maps, z, part)
+    blended = 0.25 * (shaded[:, :-1:2] + 2 * shaded[:, 1::2] + shaded[:, 2::2])
+    blended = 0.25 * (blended[:, :, :-1:2] + 2 * blended[:, :, 1::2] + blended[:, :, 2::2])
+    window = rgb[:, top:bottom, left:right]
+    window.mul_(1 - blended[3]).add_(blended[:3])
+    z, part = z[1::2, 1::2], part[1::2, 1::2]
+    space = depth[top:bottom, left:right]
+    space.copy_(torch.where(part >= 0, z, space))
+    mask[top:bottom, left:right] = (part >= 0) & (part < len(textures) - 1)
+    return SyntheticFrame(rgb, depth, mask)
 
 
 def sense(frame: SyntheticFrame, noise: SensorNoise, generator: torch.Generator) -> SyntheticFrame:
@@ -100,9 +107,12 @@ def sense(frame: SyntheticFrame, noise: SensorNoise, generator: torch.Generator)
     size = frame.depth.shape
     rgb = frame.rgb + noise.image * torch.randn(3, *size, generator=generator, dtype=torch.float32)
     z = frame.depth
-    high = F.max_pool2d(z[None, None], 3, 1, 1)[0, 0]
-    low = -F.max_pool2d(-z[None, None], 3, 1, 1)[0, 0]
-    lost = (high - low > noise.edge) | (z < noise.near) | (z > noise.far)
+    lost = (z < noise.near) | (z > noise.far)
+    down, right = (z[1:] - z[:-1]).abs() > noise.edge, (z[:, 1:] - z[:, :-1]).abs() > noise.edge
+    lost[1:] |= down
+    lost[:-1] |= down
+    lost[:, 1:] |= right
+    lost[:, :-1] |= right
     lost |= torch.rand(size, generator=generator, dtype=torch.float32) < noise.dropout
     z = z + noise.depth * z * z * torch.randn(size, generator=generator, dtype=torch.float32)
     step = noise.step * z * z
@@ -150,33 +160,37 @@ def _background(
     return fine[:3].contiguous(), fine[3]
 
 
-def _colour(
-    scene: RoundCones, textures: list[SolidTexture], rotation: Tensor, origin_map: Tensor, direction_map: Tensor,
-    boxes: Tensor, size: tuple[int, int],
-) -> tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "1 1 h w"]]:  # fmt: skip
-    """Shaded colour (black where nothing is hit) and coverage of body and ball."""
-    depth, part = cast_image(scene, origin_map, direction_map, boxes, size)
+def _shade(
+    scene: RoundCones,
+    textures: list[SolidTexture],
+    rotation: Tensor,
+    maps: tuple[Tensor, Tensor],
+    depth: Tensor,
+    part: Tensor,
+) -> Float[Tensor, "4 height width"]:
+    """Shaded colour and coverage of body and ball; all zero where nothing is hit."""
     light = F.normalize(rotation @ torch.tensor(_LIGHT).to(rotation), dim=0)
     up = rotation[:, 1]
-    where = (part.flatten() >= 0).nonzero()[:, 0]
-    owner = part.flatten()[where]
+    owner = part.flatten()
+    canvas = torch.zeros(owner.shape[0], 4, dtype=depth.dtype, device=depth.device)
+    where = (owner >= 0).nonzero()[:, 0]
     # One sort brings each part's pixels together.
-    owner, order = owner.sort(stable=True)
+    owner, order = owner[where].sort()
     where = where[order]
-    pixel = torch.stack([where % size[1], where // size[1], torch.ones_like(where)], -1).to(origin_map)
-    points = pixel @ origin_map.T + depth.flatten()[where][:, None] * (pixel @ direction_map.T)
-    shaded = torch.empty_like(points)
-    counts = torch.bincount(owner, minlength=len(textures)).tolist()
+    width = depth.shape[1]
+    pixel = torch.stack([where % width, where // width, torch.ones_like(where)], -1).to(depth)
+    points = pixel @ maps[0].T + depth.flatten()[where][:, None] * (pixel @ maps[1].T)
+    shaded = []
     begin = 0
-    for index, count in enumerate(counts):
+    for index, count in enumerate(torch.bincount(owner, minlength=len(textures)).tolist()):
         if not count:
             continue
         block = slice(begin, begin + count)
         begin += count
         local = (points[block] - scene.origins[index]) @ scene.rotations[index]
-        normal = surface_normals(scene, owner[block], local) @ scene.rotations[index].T
+        normal = surface_normals(scene, index, local) @ scene.rotations[index].T
         lamp, sky = (normal @ light).clamp_min(0), 0.5 + 0.5 * (normal @ up)
-        shaded[block] = sample_texture(textures[index], local) * (0.40 + 0.50 * lamp + 0.15 * sky)[:, None]
-    colour = torch.zeros(3, size[0] * size[1], dtype=points.dtype, device=points.device)
-    colour[:, where] = shaded.clamp(0, 1).T
-    return colour.view(1, 3, *size), (part >= 0).to(points.dtype)[None, None]
+        shaded.append(sample_texture(textures[index], local) * (0.40 + 0.50 * lamp + 0.15 * sky)[:, None])
+    if shaded:
+        canvas[where] = F.pad(torch.cat(shaded).clamp(0, 1), (0, 1), value=1.0)
+    return canvas.T.reshape(4, *depth.shape)
