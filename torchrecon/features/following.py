@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -87,7 +88,7 @@ def born(region: Region, xy: Float[Tensor, "points 2"], first_id: int, half: int
 
 
 def match_covariance(
-    templates: Templates, residual: Float[Tensor, "points samples"], half: int
+    templates: Templates, residual: Float[Tensor, "points samples"], half: int, misfit: float = 0.0
 ) -> Float[Tensor, "points 2 2"]:
     """Covariance of a matched position: ``2 s_n^2 J^-1 J2 J^-1``, J the structure tensor of the template.
 
@@ -100,11 +101,14 @@ def match_covariance(
         templates: the matched windows.
         residual: in standard deviations of the template.
         half: half width of the window, pixels.
+        misfit: noise that is there however quiet the sensor, in standard deviations of the template, because no warp
+            fits a window of a bent surface exactly.
     """
     side = 2 * half + 1
     used = templates.weights > 0.05 * templates.weights.amax(-1, keepdim=True)
     absolute = torch.where(used, residual.abs(), torch.nan)
-    noise = 1.4826 * absolute.nanmedian(-1).values * templates.deviation  # of the difference: sqrt(2) s_n
+    deviation = 1.4826 * absolute.nanmedian(-1).values  # of a difference: sqrt(2) s_n
+    noise = torch.sqrt(deviation**2 + misfit**2) * templates.deviation
     image = (residual * templates.weights.sqrt()).reshape(-1, side, side)
     power = image.square().mean((-1, -2)).clamp_min(1e-12)
     lag_x = (image[:, :, 1:] * image[:, :, :-1]).mean((-1, -2)) / power
@@ -128,13 +132,31 @@ def _stretch(affine: Tensor) -> Tensor:
     return torch.maximum(larger, larger / determinant)
 
 
-def _neighbour_median(xy: Tensor, values: Tensor, count: int) -> Tensor:
-    """Median of ``values`` (n, 2) over the nearest other points; the values themselves where there is none."""
-    if len(xy) <= count:
-        return values
+def _local_motion(xy: Tensor, moved: Tensor, covariance: Tensor, trusted: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Where each point would be if it moved as its neighbours do, and the variance (px^2) of that guess.
+
+    An affine motion is fitted to the displacements of the ``count`` nearest trusted others, the better localised
+    ones weighing more; the variance is the scatter of the neighbours about the fit.
+    """
+    total = int(trusted.sum())
+    if total < 6:
+        return moved, torch.full_like(moved[:, 0], 1e6)
     distance = torch.cdist(xy, xy).fill_diagonal_(torch.inf)
-    median: Tensor = values[distance.topk(count, largest=False).indices].median(1).values
-    return median
+    distance = distance.masked_fill(~trusted, torch.inf)
+    near, index = distance.topk(min(count, total - 1), largest=False)
+    weight = 1.0 / (covariance.diagonal(dim1=-2, dim2=-1).sum(-1)[index] + 0.02)
+    weight = weight * torch.exp(-0.5 * (near / near.median(1, keepdim=True).values.clamp_min(1.0)) ** 2)
+    weight = torch.where(torch.isfinite(near), weight, torch.zeros_like(weight))
+    scale = near.median(1).values.clamp_min(1.0)[:, None, None]
+    offset = (xy[index] - xy[:, None]) / scale
+    design = torch.cat([torch.ones_like(offset[..., :1]), offset], -1)
+    step = (moved - xy)[index]
+    normal = (design * weight[..., None]).mT @ design
+    ridge = weight.sum(1)[:, None, None] * torch.diag(xy.new_tensor([1e-4, 0.1, 0.1]))
+    fit = torch.linalg.solve(normal + ridge, (design * weight[..., None]).mT @ step)
+    rest = (step - design @ fit).square().sum(-1) / 2
+    # Median, not mean: one stray neighbour must not widen the gate; ln 2 is the median of that chi^2.
+    return xy + fit[:, 0], rest.median(1).values / math.log(2.0)
 
 
 def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> Alive:
@@ -144,7 +166,7 @@ def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> A
     own template, which does not drift. Where the template no longer fits but the last frame does, the template is
     taken anew from the last frame and the error of the position there stays with the track (``anchor``).
     """
-    half = params.window
+    half, percent = params.window, now.size / 100.0
     predicted = abg_predict(alive.state, 1.0)
     start, guess = alive.xy - last.origin, predicted[..., 0] - now.origin
     moved, step_score = align_translation(
@@ -170,13 +192,24 @@ def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> A
         xy, affine, score, residual, anchor = (v.clone() for v in (xy, affine, score, residual, anchor))
         xy[stale], affine[stale], score[stale], residual[stale] = renewed
         anchor[stale] = torch.nan_to_num(alive.covariance[stale])
-    covariance = anchor + match_covariance(templates, residual, half)
-
-    surprise = xy - guess
-    odd = (surprise - _neighbour_median(guess, surprise, 8)).norm(dim=-1)
+    match = match_covariance(templates, residual, half, params.misfit)
     good = fits(xy, affine, score, params.min_correlation) & (step_score > params.min_correlation)
-    good &= ((back - start).norm(dim=-1) < params.max_backward) & (odd < params.max_neighbour) & now.admits(xy)
-    good &= torch.linalg.eigvalsh(covariance)[:, -1] < params.max_std**2
+    good &= ((back - start).norm(dim=-1) < params.max_backward) & torch.isfinite(xy).all(-1)
+
+    # Along an edge or a stripe the window says little: there the neighbours' motion decides (Kalman update).
+    expected, spread = _local_motion(start, xy, match, good, 12)
+    prior = torch.nan_to_num(alive.covariance) - alive.anchor
+    prior[stale] = 0.0
+    prior = prior + (spread + (params.local_std * percent) ** 2)[:, None, None] * _identity(len(xy), xy)
+    innovation = torch.linalg.inv(match + prior)
+    gain = match @ innovation
+    odd = expected - xy
+    good &= (odd[:, None] @ innovation @ odd[..., None])[:, 0, 0] < params.gate**2
+    good &= odd.norm(dim=-1) < params.max_neighbour * percent
+    xy = xy + (gain @ odd[..., None])[..., 0]
+    match = match - gain @ match
+    covariance = anchor + (match + match.mT) / 2
+    good &= now.admits(xy) & (torch.linalg.eigvalsh(covariance)[:, -1] < (params.max_std * percent) ** 2)
 
     found = xy + now.origin
     state = abg_update(predicted, found, abg_gains(params.alpha), 1.0)

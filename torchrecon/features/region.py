@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 
 from torchrecon._typing import Bool, Float, Tensor
-from torchrecon.features.patches import image_pyramid, patch_grid, sample_image, to_gray
+from torchrecon.features.patches import gaussian_blur, image_pyramid, patch_grid, sample_image, to_gray
 
-__all__ = ["Region", "cut_region", "depth_edges", "erode"]
+__all__ = ["Region", "cut_region", "depth_edges", "erode", "remove_shading"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +20,12 @@ class Region:
 
     Attributes:
         gray: (h, w) grey values of the cut.
-        pyramid: of ``gray``, level 0 lightly smoothed.
+        pyramid: of ``gray``, level 0 lightly smoothed and freed of shading.
         inside: per level 1.0 on the object; None means everywhere.
         births: (h, w) where points may be born.
         allowed: (h, w) where points may live.
         origin: (2,) x, y of the cut's first pixel in the image.
+        size: of the object, pixels: square root of its area; without a mask a fifth of the frame's.
     """
 
     gray: Tensor
@@ -33,6 +34,7 @@ class Region:
     births: Tensor
     allowed: Tensor
     origin: Tensor
+    size: float
 
     def admits(self, xy: Float[Tensor, "points 2"]) -> Bool[Tensor, " points"]:
         """Whether the nearest pixel lies in the cut and points may live there; ``xy`` in the cut."""
@@ -82,6 +84,31 @@ def depth_edges(depth: Float[Tensor, "height width"], jump: float, radius: int) 
     return ((far + near)[0, 0] > jump) | ~known
 
 
+def remove_shading(
+    gray: Float[Tensor, "height width"], inside: Float[Tensor, "height width"] | None, sigma: float
+) -> Float[Tensor, "height width"]:
+    """Logarithm of the grey values minus its local mean on the object.
+
+    Shading stays with the light while texture moves with a turning body, so slow variations would pull a match
+    back; in the logarithm shading is an offset, and the mean over ``sigma`` pixels takes it out.
+
+    Args:
+        gray: values in [0, 1].
+        inside: 1 on the object, only there is the mean taken; elsewhere the result is 0. None: everywhere.
+        sigma: pixels.
+
+    Example:
+        >>> import torch
+        >>> float(remove_shading(torch.full((9, 9), 0.4), None, 2.0).abs().max()) < 1e-6
+        True
+    """
+    log = torch.log(gray.clamp_min(0) + 0.05)  # the offset keeps the noise of dark pixels in bounds
+    if inside is None:
+        return log - gaussian_blur(log, sigma)
+    share = gaussian_blur(inside, sigma).clamp_min(1e-3)
+    return torch.where(inside > 0, log - gaussian_blur(log * inside, sigma) / share, torch.zeros_like(log))
+
+
 def _box(mask: Tensor, around: Tensor, margin: int) -> tuple[int, int, int, int] | None:
     """x0, y0, x1, y1 of the mask and the points with a margin, at least 32 pixels a side where the image has them."""
     height, width = mask.shape
@@ -109,6 +136,7 @@ def cut_region(
     birth_margin: float,
     depth_jump: float,
     edge_radius: int,
+    shading_sigma: float,
 ) -> Region | None:
     """Cut a frame to the object; None where there is neither mask nor point to look at.
 
@@ -122,6 +150,7 @@ def cut_region(
         birth_margin: pixels that new points keep from the mask's border.
         depth_jump: metres, see :func:`depth_edges`.
         edge_radius: pixels, see :func:`depth_edges`.
+        shading_sigma: pixels, see :func:`remove_shading`; 0 leaves the grey values as they are.
     """
     height, width = frame.shape[-2:]
     box = (0, 0, width, height) if mask is None else _box(mask, around, margin)
@@ -141,4 +170,8 @@ def cut_region(
         smooth = ~depth_edges(depth[y0:y1, x0:x1], depth_jump, edge_radius)
         births, allowed = births & smooth, allowed & smooth
     origin = frame.new_tensor([float(x0), float(y0)])
-    return Region(gray, image_pyramid(gray, levels), inside, births, allowed, origin)
+    pyramid = image_pyramid(gray, levels)
+    if shading_sigma > 0:
+        pyramid[0] = remove_shading(pyramid[0], None if inside is None else inside[0], shading_sigma)
+    area = height * width / 25.0 if mask is None else max(float(mask.sum()), 900.0)
+    return Region(gray, pyramid, inside, births, allowed, origin, math.sqrt(area))

@@ -30,7 +30,7 @@ class TrackerParams:
     """Parameters of the tracker.
 
     Attributes:
-        window: half width of the matched window, pixels; 7 means 15 x 15.
+        window: half width of the matched window, pixels; 5 means 11 x 11.
         levels: pyramid levels for the search from frame to frame; each doubles the reach.
         iterations: Gauss-Newton steps per level.
         alpha: position gain of the alpha-beta-gamma predictor, in (0, 1).
@@ -44,13 +44,18 @@ class TrackerParams:
         max_stretch: factor by which a template may be stretched or shrunk before it is taken anew.
         max_disagreement: pixels between the match with the last frame and the match with the template.
         max_backward: pixels between a point and what comes back after matching forward and backward.
-        max_neighbour: pixels by which a point's surprise (found minus predicted) may differ from its neighbours'.
-        max_std: pixels; a track whose position has become less certain than this along any direction ends.
+        gate: standard deviations by which a point's step may differ from what its neighbours' steps suggest.
+        max_neighbour: the same difference in percent of the object's size (square root of its area).
+        local_std: percent of the object's size; how well a point moves with its neighbours at best.
+        max_std: percent of the object's size; a track whose position has become less certain than this along any
+            direction ends.
+        misfit: share of a window's contrast that no warp explains; lower limit of the noise in the covariance.
+        shading_sigma: pixels; grey values are matched after their local mean over this range is taken out; 0 = not.
         depth_jump: metres; a step of depth near a point that counts as an edge (where depth is given).
         sift: detection parameters.
     """
 
-    window: int = 7
+    window: int = 5
     levels: int = 3
     iterations: int = 6
     alpha: float = 0.8
@@ -59,13 +64,17 @@ class TrackerParams:
     min_distance: float = 5.0
     min_length: int = 5
     mask_margin: float = 2.0
-    min_correlation: float = 0.8
-    renew_correlation: float = 0.9
-    max_stretch: float = 1.6
-    max_disagreement: float = 1.0
+    min_correlation: float = 0.7
+    renew_correlation: float = 0.75
+    max_stretch: float = 2.5
+    max_disagreement: float = 2.0
     max_backward: float = 0.7
-    max_neighbour: float = 3.0
-    max_std: float = 1.5
+    gate: float = 3.0
+    max_neighbour: float = 0.9
+    local_std: float = 0.25
+    max_std: float = 0.7
+    misfit: float = 0.15
+    shading_sigma: float = 5.0
     depth_jump: float = 0.08
     sift: SiftParams = field(default_factory=lambda: SiftParams(contrast=0.006))
 
@@ -158,6 +167,7 @@ def track_points(
         region = cut_region(
             frame, mask, depth, around, levels=params.levels, margin=4 * params.window,
             birth_margin=params.mask_margin, depth_jump=params.depth_jump, edge_radius=params.window // 2,
+            shading_sigma=params.shading_sigma,
         )  # fmt: skip
         if region is None or last is None:
             alive = None
