@@ -1,0 +1,50 @@
+"""Readers of the public sequences, and the metric that a stored result pins down."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrecon.data.benchmarks import SEQUENCES, load_benchmark
+from torchrecon.errors import ReconError
+from torchrecon.metrics import error3d_akhter
+
+SHAPES = {
+    "drink": (1102, 41),
+    "pickup": (357, 41),
+    "yoga": (307, 41),
+    "stretch": (370, 41),
+    "dance": (264, 75),
+    "walking": (260, 55),
+    "face": (316, 40),
+    "shark": (240, 91),
+}
+
+
+def test_all_eight_have_their_published_size(data_dir):
+    for name in SEQUENCES:
+        assert load_benchmark(name, data_dir / "nrsfm").points3d.shape == (*SHAPES[name], 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "published"),
+    [("drink", 0.0250), ("pickup", 0.2369), ("yoga", 0.1625), ("stretch", 0.1088), ("dance", 0.2956)],
+)
+def test_stored_pta_result_scores_as_published(name, published, data_dir):
+    sequence = load_benchmark(name, data_dir / "nrsfm")
+    assert abs(float(error3d_akhter(sequence.stored_pta, sequence.canonical)) - published) < 1e-4
+
+
+def test_camera_frame_is_a_rotated_world_frame(data_dir):
+    sequence = load_benchmark("pickup", data_dir / "nrsfm")
+    centred = [x - x.mean(-2, keepdim=True) for x in (sequence.points3d, sequence.canonical)]
+    torch.testing.assert_close(
+        torch.cdist(centred[0], centred[0]), torch.cdist(centred[1], centred[1]), rtol=1e-6, atol=1e-6
+    )
+
+
+def test_missing_data_is_named(tmp_path):
+    with pytest.raises(ReconError, match="camera_frame"):
+        load_benchmark("yoga", tmp_path)
+    with pytest.raises(ReconError, match="not one of"):
+        load_benchmark("jog", tmp_path)
