@@ -22,8 +22,8 @@ from torchrecon.errors import ReconError
 __all__ = ["Camera", "handheld_camera", "panning_camera", "static_camera", "turning_camera"]
 
 _PROJECTIONS = ("pinhole", "weak_perspective", "orthographic")
-_FOCAL_PER_HEIGHT = 2.0
-"""Default focal length over image height: 1.8 m at 7 m is about 300 of 576 pixels."""
+_FOCAL_PER_HEIGHT = 2.3
+"""Default focal length over image height: 1.8 m at 7 m is about 340 of 576 pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def turning_camera(
         total_turn_deg: angle of the orbit over the whole clip, degrees; the direction is drawn.
         distance: metres from the player.
         size: (height, width) pixels.
-        focal: pixels; default twice the image height (1.8 m at 7 m: about 300 of 576 pixels), or less where the
+        focal: pixels; default 2.3 image heights (1.8 m at 7 m: about 340 of 576 pixels), or less where the
             player would leave the image.
         projection: ``pinhole``, ``weak_perspective`` or ``orthographic``.
     """

@@ -190,7 +190,7 @@ def _shade(
         local = (points[block] - scene.origins[index]) @ scene.rotations[index]
         normal = surface_normals(scene, index, local) @ scene.rotations[index].T
         lamp, sky = (normal @ light).clamp_min(0), 0.5 + 0.5 * (normal @ up)
-        shaded.append(sample_texture(textures[index], local) * (0.40 + 0.50 * lamp + 0.15 * sky)[:, None])
+        shaded.append(sample_texture(textures[index], local) * (0.47 + 0.48 * lamp + 0.15 * sky)[:, None])
     if shaded:
         canvas[where] = F.pad(torch.cat(shaded).clamp(0, 1), (0, 1), value=1.0)
     return canvas.T.reshape(4, *depth.shape)

@@ -83,9 +83,11 @@ def _grid(part: int, body: Body) -> tuple[Tensor, Tensor, tuple[int, int, int], 
 def body_textures(body: Body) -> list[SolidTexture]:
     """One texture per part: jersey with number and stripes, shorts, skin, hair and face, socks, shoes."""
     g = torch.Generator().manual_seed(body.texture_seed)
-    jersey, shorts, trim = _colour(g, 0.1, 0.9), _colour(g, 0.1, 0.8), _colour(g, 0.05, 0.95)
+    jersey, shorts = _colour(g, 0.25, 0.8), _colour(g, 0.25, 0.75)
+    # The trim (number, stripes, socks) stands out in brightness from the jersey, as on any kit.
+    trim = _colour(g, 0.1, 0.5) + (0.45 if float(jersey.mean()) < 0.5 else 0.0)
     tone = float(torch.rand((), generator=g, dtype=torch.float32))
-    skin = torch.tensor([0.82, 0.62, 0.5]) * (1 - tone) + torch.tensor([0.38, 0.24, 0.17]) * tone
+    skin = torch.tensor([0.82, 0.62, 0.5]) * (1 - tone) + torch.tensor([0.48, 0.33, 0.25]) * tone
     skin = skin.to(torch.float32)
     hair, shoe = _colour(g, 0.05, 0.3), _colour(g, 0.1, 0.9)
     number = str(int(torch.randint(1, 100, (), generator=g)))
@@ -96,7 +98,7 @@ def body_textures(body: Body) -> list[SolidTexture]:
         low, high, shape, xyz = _grid(part, body)
         limb = name[2:] if name[1] == "_" else name
         extent = high - low
-        noise = torch.stack([value_noise(extent, shape, (0.10, 0.05, 0.028, 0.016), g) for _ in range(2)])
+        noise = torch.stack([value_noise(extent, shape, (0.06, 0.036, 0.022), g) for _ in range(2)])
         base = {
             "thigh": shorts,
             "pelvis": shorts,
@@ -107,15 +109,16 @@ def body_textures(body: Body) -> list[SolidTexture]:
         }.get(limb, skin)
         colour = base[:, None, None, None].expand(3, *shape).clone()
         x, y, z = xyz
-        contrast = 0.085
+        contrast = 0.19
         if limb in ("chest", "collar", "abdomen", "pelvis", "thigh"):
-            contrast = 0.17
+            contrast = 0.24
             band = torch.remainder(y + 0.02 * noise[1], stripes) < 0.22 * stripes
             side = x.abs() > 0.82 * float(high[0])
-            colour[:, band | side] = trim[:, None]
+            striped = side if limb == "chest" else band | side
+            colour[:, striped] = trim[:, None]
         if limb == "thigh":
             colour[:, y > 0.78 * float(body.length[part])] = skin[:, None]
-            contrast = 0.15
+            contrast = 0.22
         if limb == "chest":
             _print_number(colour, xyz, number, trim, centre=0.42 * float(body.length[part]), height=0.10 * h)
         if limb == "head":
@@ -126,13 +129,13 @@ def body_textures(body: Body) -> list[SolidTexture]:
                 colour[:, eye & (z > 0)] = 0.06
             mouth = (x.abs() < 0.3 * float(high[0])) & ((y + 0.5 * float(high[1])).abs() < 0.006) & (z > 0)
             colour[:, mouth] = torch.tensor([0.5, 0.15, 0.15], dtype=torch.float32)[:, None]
-            contrast = 0.12
+            contrast = 0.19
         if limb == "shank":
             sock = y > 0.68 * float(body.length[part])
             colour[:, sock] = trim[:, None]
             colour[:, sock & (torch.remainder(y, 0.06) < 0.02)] = jersey[:, None]
         if limb == "foot":
-            contrast = 0.2
+            contrast = 0.24
         mottle = contrast * torch.tanh(1.6 * noise[0])
         tint = 0.35 * contrast * torch.stack([noise[1], -0.5 * noise[1], -0.7 * noise[1]])
         textures.append(SolidTexture((colour + mottle + tint).clamp(0.02, 1).contiguous(), low, high))
