@@ -9,10 +9,11 @@ from torchrecon.measurement import Solver
 from torchrecon.nrsfm.auto import auto
 from torchrecon.nrsfm.lowrank import logdet
 from torchrecon.nrsfm.rigid import rigid
+from torchrecon.nrsfm.trajectory import trajectory
 
-__all__ = ["SOLVERS", "auto", "get_solver", "logdet", "rigid"]
+__all__ = ["SOLVERS", "auto", "get_solver", "logdet", "rigid", "trajectory"]
 
-SOLVERS: dict[str, Solver] = {"auto": auto, "logdet": logdet, "rigid": rigid}
+SOLVERS: dict[str, Solver] = {"auto": auto, "logdet": logdet, "rigid": rigid, "trajectory": trajectory}
 
 
 def get_solver(name: str) -> Solver:

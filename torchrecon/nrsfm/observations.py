@@ -35,6 +35,14 @@ class Observations:
     offset: Float[Tensor, " 2"]
     tracks: Tracks
 
+    @property
+    def length(self) -> Tensor:
+        """Metres per unit of length: from the median measured depth, or one where there is no depth."""
+        if self.tracks.depth is None:
+            return torch.ones_like(self.unit)
+        there = self.visible & torch.isfinite(self.tracks.depth)
+        return self.tracks.depth[there].median() * self.unit if there.any() else torch.ones_like(self.unit)
+
     def held(self) -> Float[Tensor, "frames points 2"]:
         """Every entry with a value: unseen ones take the point's nearest seen position, moved with the frame's mean.
 

@@ -1,0 +1,268 @@
+"""Tracks that are born and die: a turning view and Gaussian-process trajectories, fitted by maximum likelihood.
+
+What is sought is the camera path alone; the points are integrated out (see ``likelihood``). A turn at constant
+angular velocity is looked for on a grid of axes and rates, with rest positions spread about the axis as the image
+shows them: an isotropic prior would charge every point for a depth extent that the body does not have, and so favour
+too slow a turn. The best candidates are refined with a smooth translation. Rotations that are free in every frame
+raise the likelihood and the error together (limbs are explained by wobble), so they are not offered. The points are
+then the posterior mean. With intrinsics the likelihood itself tells the two mirror images apart; without, the
+documented rule picks one. Assumption to keep in mind: the view turns steadily in the axes of the body.
+Derived here; not a published method.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from torchrecon._typing import Int, Tensor
+from torchrecon.linalg import rotation_from_vector
+from torchrecon.measurement import Reconstruction, Status, Tracks
+from torchrecon.nrsfm.base import check_size, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.likelihood import (
+    CameraPath,
+    MotionPrior,
+    Packed,
+    matern32,
+    negative_log_likelihood,
+    pack,
+    posterior_points,
+)
+from torchrecon.nrsfm.observations import Observations, observe
+
+__all__ = ["TrajectoryParams", "solve_trajectories", "trajectory"]
+
+
+@dataclass(frozen=True)
+class TrajectoryParams:
+    """Parameters of the trajectory solver.
+
+    Attributes:
+        variances: of the deviation from the rest position per class of points, relative to the body's mean square
+            extent (no unit); smallest: trunk, largest: hands and feet.
+        memory: length of the Matern kernel of the deviation (seconds).
+        floor: variance of the unpredictable part of the deviation (relative, as ``variances``).
+        inflation: factor on the standard deviation of the observations: tracks drift more than their covariance says.
+        default_noise: standard deviation where no covariance is given (rms sizes of the body in the image).
+        rates: angular velocities of the grid (degrees per second), tried in both senses where the sense matters.
+        axes: directions of the turning axis in the image (degrees from the vertical).
+        entries: observations per point that the search uses at most; frames are thinned to reach it (count).
+        search_points: longest tracks that the search uses (count).
+        candidates: grid points that are refined (count).
+        iterations: descent steps per candidate (count).
+        drift: standard deviation of the translation about the mean image position of the seen points (rms sizes).
+        drift_memory: its time scale (seconds).
+        rate_spread: standard deviation of the angular velocity about the grid point (degrees per second).
+        static_turn: change of view below which depth is called undetermined (degrees).
+    """
+
+    variances: tuple[float, ...] = (0.001, 0.01, 0.05, 0.3)
+    memory: float = 0.2
+    floor: float = 1e-5
+    inflation: float = 1.4
+    default_noise: float = 0.01
+    rates: tuple[float, ...] = (25.0, 50.0, 75.0, 100.0, 125.0, 150.0, 200.0)
+    axes: tuple[float, ...] = (0.0, 45.0, 90.0, 135.0)
+    entries: int = 20
+    search_points: int = 250
+    candidates: int = 2
+    iterations: int = 25
+    drift: float = 0.3
+    drift_memory: float = 0.4
+    rate_spread: float = 25.0
+    static_turn: float = 10.0
+
+
+def _centres(data: Observations) -> Tensor:
+    """Mean image position of the seen points (F, 2), interpolated over frames that see nothing."""
+    count = data.visible.sum(1)
+    mean = data.xy.sum(1) / count.clamp_min(1)[:, None]
+    if bool((count > 0).all()):
+        return mean
+    seen = (count > 0).nonzero()[:, 0]
+    frames = torch.arange(len(count), device=seen.device)
+    right = torch.searchsorted(seen, frames).clamp(max=len(seen) - 1)
+    left = (right - 1).clamp_min(0)
+    span = (seen[right] - seen[left]).clamp_min(1)
+    part = ((frames - seen[left]) / span).clamp(0, 1).to(mean.dtype)[:, None]
+    return torch.where((count > 0)[:, None], mean, mean[seen[left]] * (1 - part) + mean[seen[right]] * part)
+
+
+def _prior(data: Observations, axis: Tensor, params: TrajectoryParams) -> MotionPrior:
+    """Rest positions as wide along and across the axis as the image shows them, and one kernel per class."""
+    spread = torch.where(data.visible[..., None], data.xy - _centres(data)[:, None], data.xy.new_zeros(()))
+    second = torch.einsum("fpa,fpb->ab", spread, spread) / data.visible.sum()
+    along = axis[:2] @ second @ axis[:2]
+    across = (second.trace() - along).clamp_min(1e-3 * along)
+    eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    rest = across * eye + (along - across) * axis[:, None] * axis
+    size = (along + across) / 2
+    times = data.tracks.times
+    base = matern32(times, params.memory)
+    jitter = params.floor * torch.eye(len(times), dtype=axis.dtype, device=axis.device)
+    kernels = torch.stack([size * (variance * base + jitter) for variance in params.variances])
+    share = kernels.new_full((len(params.variances),), -math.log(len(params.variances)))
+    return MotionPrior(rest, kernels, share)
+
+
+def _distances(data: Observations) -> Tensor:
+    """Start of the log scale: zero, or the measured distance of the body where there is depth."""
+    depth = data.tracks.depth
+    start = torch.zeros_like(data.tracks.times)
+    if depth is None:
+        return start
+    there = data.visible & torch.isfinite(depth)
+    body = torch.where(there, depth, depth.new_full((), float("nan"))).nanmedian(1).values / data.length
+    return torch.where(torch.isfinite(body), -torch.log(body * data.unit), start)
+
+
+def _start(data: Observations) -> tuple[Tensor, Tensor]:
+    """Translation and log scale that put the mean of the seen points at the origin of the body."""
+    log_scale = _distances(data)
+    centres = _centres(data)
+    if data.tracks.intrinsics is None:
+        return centres, log_scale
+    distance = torch.exp(-log_scale) / data.unit
+    return (data.offset + data.unit * centres) * distance[:, None], log_scale
+
+
+def _turning(times: Tensor, velocity: Tensor) -> Tensor:
+    """Rotations (F, 3, 3) at constant angular velocity (3,) in radians per second, identity in mid-sequence."""
+    return rotation_from_vector((times - times.mean())[:, None] * velocity)
+
+
+def _refine(
+    packed: Packed, data: Observations, velocity: Tensor, prior: MotionPrior, noise: float, params: TrajectoryParams
+) -> tuple[float, Tensor, CameraPath]:
+    """Angular velocity and smooth translation of highest posterior density near a grid point."""
+    times = data.tracks.times
+    shift, log_scale = _start(data)
+    eye = torch.eye(len(times), dtype=times.dtype, device=times.device)
+    drift = torch.linalg.cholesky(
+        params.drift**2 * matern32(times, params.drift_memory) + (0.1 * params.drift) ** 2 * eye
+    )
+    unknown = torch.zeros(3 + 2 * len(times), dtype=times.dtype, device=times.device, requires_grad=True)
+    optimiser = torch.optim.LBFGS(
+        [unknown],
+        max_iter=params.iterations,
+        max_eval=params.iterations * 5 // 4,
+        history_size=15,
+        line_search_fn="strong_wolfe",
+    )
+
+    def path() -> tuple[Tensor, CameraPath]:
+        speed = velocity + math.radians(params.rate_spread) * unknown[:3]
+        return speed, CameraPath(_turning(times, speed), shift + drift @ unknown[3:].view(len(times), 2), log_scale)
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        value = negative_log_likelihood(packed, path()[1], prior, noise) + 0.5 * unknown.square().sum()
+        value.backward()  # type: ignore[no-untyped-call]
+        return value
+
+    with torch.enable_grad():
+        optimiser.step(closure)  # type: ignore[arg-type]
+    with torch.no_grad():
+        speed, found = path()
+        value = negative_log_likelihood(packed, found, prior, noise) + 0.5 * unknown.square().sum()
+    return float(value), speed, found
+
+
+def _grid(data: Observations, params: TrajectoryParams) -> list[Tensor]:
+    """Angular velocities (3,) in radians per second; one sense only where the mirror image is as likely."""
+    senses = (1.0, -1.0) if data.tracks.intrinsics is not None else (1.0,)
+    grid = []
+    for degrees in params.axes:
+        angle = math.radians(degrees)
+        axis = data.xy.new_tensor([math.sin(angle), math.cos(angle), 0.0])
+        grid += [axis * (sense * math.radians(rate)) for rate in params.rates for sense in senses]
+    return grid
+
+
+def solve_trajectories(
+    item: Tracks, rank: int, generator: torch.Generator, params: TrajectoryParams | None = None
+) -> Reconstruction:
+    """Solve one sequence of any visibility; see the module's text. Nothing is random, ``generator`` is not used."""
+    params = params or TrajectoryParams()
+    data = observe(item)
+    noise = params.inflation if data.noise_known else params.default_noise
+    longest = int(data.visible.sum(0).max())
+    thinned = pack(data, max(1, -(-longest // params.entries)))
+    order = torch.argsort(thinned.seen.sum(1), descending=True, stable=True)[: params.search_points]
+    search = thinned.select(order)
+    shift, log_scale = _start(data)
+    scored = []
+    with torch.no_grad():
+        for velocity in _grid(data, params):
+            prior = _prior(data, velocity / velocity.norm(), params)
+            path = CameraPath(_turning(item.times, velocity), shift, log_scale)
+            scored.append((float(negative_log_likelihood(search, path, prior, noise)), velocity))
+    scored.sort(key=lambda entry: entry[0])
+    answers = []
+    for _, velocity in scored[: params.candidates]:
+        prior = _prior(data, velocity / velocity.norm(), params)
+        answers.append((*_refine(search, data, velocity, prior, noise, params), prior))
+    _, speed, path, prior = min(answers, key=lambda answer: answer[0])
+    with torch.no_grad():
+        canonical, spread, _ = posterior_points(pack(data), path, prior, noise)
+    rotations = path.rotations
+    points3d = canonical @ rotations.mT
+    covariance = rotations[:, None] @ spread @ rotations.mT[:, None]
+    turn = float(turn_of_view(rotations))
+    rate = math.degrees(float(speed.norm()))
+    status = check_size(item, 1)
+    if status is None and turn < params.static_turn and item.depth is None:
+        status = Status("undetermined", f"the view turns by only {turn:.1f} degrees; depth is not determined")
+    if status is None:
+        status = Status("ok", f"steady turn of {rate:.0f} degrees per second, best of {len(scored)} axes and rates")
+    if item.intrinsics is not None:
+        centre = points3d.mean(-2)
+        distance = torch.exp(-path.log_scale) / data.unit
+        placed = torch.cat([path.translation, distance[:, None]], 1) + centre
+        return Reconstruction.from_points(
+            points3d * data.length,
+            rotations,
+            rank=rank,
+            status=status,
+            translation=placed * data.length,
+            covariance3d=covariance * data.length**2,
+            intrinsics=item.intrinsics,
+            observed=data.visible,
+        )
+    flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
+    flip[2] = mirror_sign(points3d)
+    both = flip[:, None] * flip
+    return data.reconstruction(
+        points3d * flip,
+        rotations * both,
+        torch.exp(path.log_scale),
+        path.translation,
+        rank=rank,
+        status=status,
+        covariance3d=covariance * both,
+    )
+
+
+def trajectory(
+    tracks: Tracks, rank: int | Int[Tensor, "*batch"], *, generator: torch.Generator | None = None
+) -> Reconstruction:
+    """Gaussian-process trajectories under a steadily turning view; any visibility, any leading batch.
+
+    Args:
+        tracks: seen entries only are read; covariance, intrinsics and depth are used where they are there.
+        rank: reported as it is given; the solver needs none.
+        generator: taken for the contract; nothing here is random.
+
+    Example:
+        >>> import torch
+        >>> from torchrecon.linalg import rotation_from_vector
+        >>> g = torch.Generator().manual_seed(0)
+        >>> shape = torch.randn(12, 3, generator=g)
+        >>> turn = rotation_from_vector(torch.linspace(0, 2, 20)[:, None] * torch.tensor([0.0, 1.0, 0.0]))
+        >>> visible = torch.rand(20, 12, generator=g) < 0.8
+        >>> trajectory(Tracks((shape @ turn.mT)[..., :2], visible), 1).points3d.shape
+        torch.Size([20, 12, 3])
+    """
+    return solve_items(tracks, rank, solve_trajectories, generator)
