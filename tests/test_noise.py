@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchrecon.errors import ReconError
+from torchrecon.measurement import Tracks
 from torchrecon.noise import (
     HessianParams,
     StructureTensorParams,
@@ -15,6 +16,7 @@ from torchrecon.noise import (
     image_noise,
     inverse_blocks,
     mean_blocks,
+    residual_covariance,
     structure_tensor_covariance,
 )
 
@@ -176,3 +178,37 @@ def test_eq24_block_inverse_equals_the_printed_dense_formula() -> None:
 def _grid(blocks: torch.Tensor) -> list[list[np.ndarray]]:
     c1, c2, c3, c4 = _reference_dense(blocks)
     return [[c1, c2], [c3, c4]]
+
+
+def _low_rank_tracks(rank: int, noise: float, seed: int) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    t = torch.arange(80) / 80
+    phase = 2 * torch.pi * torch.rand(2, rank, generator=g)
+    rows = torch.cos(2 * torch.pi * t[:, None, None] * (1 + torch.arange(rank)) / 2 + phase)
+    xy = torch.einsum("fck,pk->fpc", rows, 30 * torch.randn(60, rank, generator=g)) + 100 * t[:, None, None]
+    return xy + noise * torch.randn(xy.shape, generator=g)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+@pytest.mark.parametrize("noise", [0.3, 2.0])
+def test_residual_covariance_recovers_the_noise(noise: float, missing: float) -> None:
+    found = []
+    for seed, rank in enumerate((3, 6, 9)):
+        xy = _low_rank_tracks(rank, noise, seed)
+        visible = torch.rand(80, 60, generator=torch.Generator().manual_seed(seed)) >= missing
+        q = residual_covariance(Tracks(xy, visible))
+        assert q.shape == (80, 60, 2, 2)
+        assert torch.equal(q, q[0, 0, 0, 0] * torch.eye(2).expand(80, 60, 2, 2))
+        found.append(float(q[0, 0, 0, 0]) ** 0.5 / noise)
+    assert all(0.85 < ratio < 1.15 for ratio in found), found
+
+
+def test_residual_covariance_shrugs_off_a_few_lost_tracks_and_refuses_too_little() -> None:
+    xy = _low_rank_tracks(3, 0.5, 0)
+    xy[40:, :2] += 60.0
+    batch = residual_covariance(Tracks(torch.stack([xy, _low_rank_tracks(3, 1.0, 1)])))
+    std = batch[:, 0, 0, 0, 0].sqrt()
+    assert float(std[0]) < 1.0
+    assert float(std[1]) == pytest.approx(1.0, rel=0.1)
+    with pytest.raises(ReconError, match="too few"):
+        residual_covariance(Tracks(torch.rand(3, 4, 2)))

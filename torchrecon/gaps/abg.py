@@ -33,7 +33,7 @@ def fill_abg(gaps: Gaps, alpha: float | None = None) -> Guess:
     started = gaps.visible.to(torch.int64).cumsum(0) > 0
     xy = torch.where(started[..., None], forward, backward.flip(0))
     since = torch.where(started, _since(gaps.visible), _since(gaps.visible.flip(0)).flip(0))
-    return Guess(xy, coasting_growth(alpha, gaps.variance, since), ~started | (since > 1))
+    return Guess(xy, coasting_growth(alpha, gaps.variance, since), ~gaps.inside | (since > 1))
 
 
 def coasting_growth(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator
 
-from torchrecon._typing import Bool, Float, Tensor
+from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.gaps.base import Gaps, Guess
 from torchrecon.gaps.rts import fill_rts
 from torchrecon.linalg.missing_factors import FactorModel, fit_factors, grow_factors, start_factors
@@ -22,68 +21,115 @@ class LowRankParams:
 
     Attributes:
         delay: frames that stand side by side in one row of the delay-embedded matrix.
-        rank: of the delay-embedded matrix.
-        window: frames that are completed together; gaps of more than a third of it go to the sequence model.
-        iterations: of the completion, at most.
+        ranks: of the delay-embedded matrix, one after the other; see :func:`fill_low_rank`.
+        window: frames that are completed together.
+        iterations: of the completion at each rank, at most.
         tolerance: stop when no filled value moves further than this, pixels.
         missing: largest share of unseen entries in a window.
-        disagree: distance between the answers from two starts that makes a value doubtful, pixels.
+        disagree: distance between two fillers that makes a value doubtful, pixels.
         bases: K of the sequence model, at most.
     """
 
     delay: int = 9
-    rank: int = 14
+    ranks: tuple[int, ...] = (3, 5, 7, 9, 11, 14)
     window: int = 120
-    iterations: int = 60
-    tolerance: float = 0.05
+    iterations: int = 15
+    tolerance: float = 0.02
     missing: float = 0.35
     disagree: float = 5.0
     bases: int = 4
 
 
+# gaps are judged together with gaps of similar length, frames
+_CLASSES = ((1, 4), (5, 15), (16, 10**9))
+
+
 def fill_low_rank(gaps: Gaps, params: LowRankParams | None = None) -> Guess:
     """Values on which all points and frames agree that share a low-rank motion.
 
-    Gaps that end: each row of the completed matrix holds ``delay`` successive frames of all points, so the filler
-    knows about motion as well as about shape. The completion is started from monotone cubics, from the smoother and
-    from the sequence model; the answer with the smallest residual beside the gap is kept, and values on which the
-    starts disagree are doubtful. Everything else (before the first and after the last observation of a point, very
-    long gaps, windows that are mostly empty, hundreds of points) comes from one probabilistic model of rank 3K for
-    the whole sequence, and is always doubtful where a point has no observation on one side.
+    Gaps that end have three candidates: completion of a delay-embedded matrix, whose rows hold ``delay`` successive
+    frames of all points so that it knows about motion as well as about shape; one probabilistic model of rank 3K for
+    the whole sequence; and the smoother. Which one to trust, and how far, is measured on the sequence itself: gaps
+    of the same length are cut into the same points beside the real ones, and the candidate that predicts those best
+    is taken for each class of lengths, with its mean squared error as the variance. The completion raises the rank
+    step by step, because a high rank from the start can reproduce any first guess.
+
+    Everything before the first and after the last observation of a point comes from the sequence model and is always
+    doubtful.
     """
     params = params or LowRankParams()
-    smooth = fill_rts(gaps)
     model = factor_model(gaps, params.bases)
     if model is None:
-        return smooth
-    xy = torch.where(gaps.visible[..., None], gaps.xy, model.predict())
+        return fill_rts(gaps)
     spread = model.variance().diagonal(dim1=-2, dim2=-1).mean(-1)
+    xy = torch.where(gaps.visible[..., None], gaps.xy, model.predict())
     growth = spread + max(model.noise - float(gaps.variance.median()), 0.0)
-    doubtful = ~gaps.inside | (spread > params.disagree**2)
-    frames, points = gaps.visible.shape
-    wanted = gaps.inside & (gaps.length <= params.window // 3)
-    if frames < 2 * params.delay or points * min(frames, params.window) ** 2 > 1.5e6 or not wanted.any():
+    doubtful = ~gaps.visible.clone()
+    if not gaps.inside.any():
         return Guess(xy, growth, doubtful)
-    starts = [torch.where(gaps.inside[..., None], other, xy) for other in (_cubic(gaps), smooth.xy)] + [xy]
-    half = params.window // 2
+    candidates = _candidates(gaps, model, params)
+    decoys, length = _decoys(gaps)
+    errors2 = None
+    if decoys.any():
+        trial = replace(gaps, visible=gaps.visible & ~decoys, inside=gaps.inside | decoys)
+        again = factor_model(trial, params.bases)
+        if again is not None:
+            errors2 = ((_candidates(trial, again, params) - gaps.xy) ** 2).sum(-1) / 2
+    depth = 1 + _depth(gaps.visible).to(xy.dtype)
+    for low, high in _CLASSES:
+        target = gaps.inside & (gaps.length >= low) & (gaps.length <= high)
+        tested = decoys & (length >= low) & (length <= high)
+        # without a test the last candidate (completion, where it was possible) is taken and flagged
+        winner, error2 = len(candidates) - 1, float(spread[target].mean()) if target.any() else 0.0
+        if errors2 is not None and tested.any():
+            winner = int(errors2[:, tested].mean(1).argmin())
+            error2 = float(errors2[winner, tested].mean())
+        apart2 = ((candidates - candidates[winner]) ** 2).sum(-1).sort(0).values[1]
+        unsure = (apart2 > params.disagree**2) | (error2 > params.disagree**2) | (not tested.any())
+        xy = torch.where(target[..., None], candidates[winner], xy)
+        profile = depth / depth[target].mean() if target.any() else depth
+        growth = torch.where(target, error2 * profile, growth)
+        doubtful = torch.where(target, unsure, doubtful)
+    return Guess(xy, growth, doubtful)
+
+
+def _candidates(gaps: Gaps, model: FactorModel, params: LowRankParams) -> Float[Tensor, "n frames points 2"]:
+    """What smoother, sequence model and (where the size allows it) completion say about every entry."""
+    smooth, predicted = fill_rts(gaps).xy, model.predict()
+    frames, points = gaps.visible.shape
+    if frames < 2 * params.delay or points * min(frames, params.window) ** 2 > 1.5e6:
+        return torch.stack([smooth, predicted])
+    start = torch.where(gaps.inside[..., None], smooth, predicted)
+    completed, half = predicted.clone(), params.window // 2
     for first in range(0, max(frames - half, 1), half):
         window = slice(first, min(first + params.window, frames))
         visible = gaps.visible[window]
+        if float((~visible).to(start.dtype).mean()) > params.missing:
+            continue
         # the ends of a window are served by its neighbours, except at the ends of the sequence
-        core = torch.zeros_like(visible)
         low = 0 if first == 0 else half // 2
         high = len(visible) if window.stop == frames else half + half // 2
-        core[low:high] = True
-        target = wanted[window] & core
-        if not target.any() or float((~visible).to(xy.dtype).mean()) > params.missing:
-            continue
-        answers = [_complete(gaps.xy[window], visible, start[window], params) for start in starts]
-        best, residual2, apart2 = _agree(answers, gaps.xy[window], visible, target)
-        xy[window] = torch.where(target[..., None], best, xy[window])
-        depth = _depth(visible).to(xy.dtype)
-        growth[window] = torch.where(target, residual2 * (1 + depth) + apart2 / 2, growth[window])
-        doubtful[window] = torch.where(target, apart2 > params.disagree**2, doubtful[window])
-    return Guess(xy, growth, doubtful)
+        answer = _complete(gaps.xy[window], visible, start[window], params)
+        completed[first + low : first + high] = answer[low:high]
+    return torch.stack([smooth, predicted, completed])
+
+
+def _decoys(gaps: Gaps) -> tuple[Bool[Tensor, "frames points"], Int[Tensor, "frames points"]]:
+    """Gaps of the same lengths in the same points, as near to the real ones as there are observations for them."""
+    frames = len(gaps.visible)
+    seen, length = gaps.visible.cpu().numpy(), gaps.length.cpu().numpy()
+    decoys, sizes = np.zeros_like(seen), np.zeros_like(length)
+    first = gaps.inside & ~torch.nn.functional.pad(gaps.inside, (0, 0, 1, 0))[:-1]
+    for start, point in first.nonzero().tolist():
+        size = int(length[start, point])
+        for shift in [s for k in range(size + 3, frames) for s in (-k, k)]:
+            low, high = start + shift, start + shift + size
+            if low < 2 or high > frames - 2 or not seen[low - 2 : high + 2, point].all():
+                continue
+            if not decoys[low - 2 : high + 2, point].any():
+                decoys[low:high, point], sizes[low:high, point] = True, size
+            break
+    return torch.from_numpy(decoys).to(gaps.visible.device), torch.from_numpy(sizes).to(gaps.visible.device)
 
 
 def factor_model(gaps: Gaps, bases: int) -> FactorModel | None:
@@ -106,17 +152,6 @@ def factor_model(gaps: Gaps, bases: int) -> FactorModel | None:
     return model
 
 
-def _cubic(gaps: Gaps) -> Float[Tensor, "frames points 2"]:
-    """Monotone cubic interpolation of the gaps that end."""
-    out = gaps.xy.clone()
-    clock = np.concatenate([[0.0], np.cumsum(gaps.steps)])
-    for point in gaps.inside.any(0).nonzero()[:, 0].tolist():
-        seen, hole = gaps.visible[:, point].cpu().numpy(), gaps.inside[:, point]
-        curve = PchipInterpolator(clock[seen], gaps.xy[gaps.visible[:, point], point].cpu().numpy(), axis=0)
-        out[hole, point] = torch.as_tensor(curve(clock[hole.cpu().numpy()])).to(out)
-    return out
-
-
 def _complete(
     xy: Tensor, visible: Bool[Tensor, "frames points"], start: Tensor, params: LowRankParams
 ) -> Float[Tensor, "frames points 2"]:
@@ -130,16 +165,17 @@ def _complete(
     rows = frames - delay + 1
     count = _overlap(filled.new_ones(rows, delay), delay, frames)
     smooth = filled
-    for _ in range(params.iterations):
-        embedded = torch.cat([filled[k : k + rows] for k in range(delay)], 1)
-        _, vectors = torch.linalg.eigh(embedded @ embedded.T)
-        leading = vectors[:, -params.rank :]
-        smooth = _overlap(leading @ (leading.T @ embedded), delay, frames) / count
-        updated = torch.where(seen, known, smooth)
-        moved = float((updated - filled).abs().max())
-        filled = updated
-        if moved < params.tolerance:
-            break
+    for rank in params.ranks:
+        for _ in range(params.iterations):
+            embedded = torch.cat([filled[k : k + rows] for k in range(delay)], 1)
+            _, vectors = torch.linalg.eigh(embedded @ embedded.T)
+            leading = vectors[:, -rank:]
+            smooth = _overlap(leading @ (leading.T @ embedded), delay, frames) / count
+            updated = torch.where(seen, known, smooth)
+            moved = float((updated - filled).abs().max())
+            filled = updated
+            if moved < params.tolerance:
+                break
     return smooth.view(frames, points, 2) + middle
 
 
@@ -149,23 +185,6 @@ def _overlap(embedded: Float[Tensor, "rows wide"], delay: int, frames: int) -> F
     for k, part in enumerate(embedded.chunk(delay, 1)):
         total[k : k + len(part)] += part
     return total
-
-
-def _agree(
-    answers: list[Tensor], xy: Tensor, visible: Tensor, target: Tensor
-) -> tuple[Tensor, Float[Tensor, "frames points"], Float[Tensor, "frames points"]]:
-    """For each point the answer with the smallest residual; that residual, and the squared distance of the others."""
-    # the residual of a wrong fill shows in the whole frames of the gap, not only at the point that is missing
-    stacked = torch.stack(answers)
-    residual2 = torch.where(visible, ((stacked - xy) ** 2).sum(-1) / 2, 0.0)
-    per_frame = residual2.sum(2) / visible.sum(1).clamp(min=1)
-    frames_of = target.to(xy.dtype)
-    score = per_frame @ frames_of / frames_of.sum(0).clamp(min=1)
-    winner = score.argmin(0)
-    column = torch.arange(xy.shape[1], device=xy.device)
-    best = stacked[winner, :, column].transpose(0, 1)
-    apart2 = ((stacked - best) ** 2).sum(-1).amax(0)
-    return best, score[winner, column].expand(visible.shape), apart2
 
 
 def _depth(visible: Bool[Tensor, "frames points"]) -> Tensor:

@@ -48,7 +48,7 @@ class StructureTensorParams:
 def grey_image(image: Float[Tensor, "channels height width"]) -> Float[Tensor, "1 1 height width"]:
     """Luma of an RGB image, or the one channel of a grey image, as a batch of one."""
     if image.shape[0] == 3:
-        return kornia.color.rgb_to_grayscale(image[None])  # type: ignore[no-any-return]
+        return kornia.color.rgb_to_grayscale(image[None])
     if image.shape[0] == 1:
         return image[None]
     raise ReconError(f"image: {image.shape[0]} channels; 1 (grey) or 3 (RGB) are needed")

@@ -15,7 +15,9 @@ from torchrecon._typing import Bool, Float, Tensor
 
 __all__ = ["Smoothed", "best_tracking_index", "rts_smooth"]
 
-# standard deviations of the unknown start, in measurement standard deviations: per frame and per frame squared
+# standard deviations of the unknown start about the first observation, in measurement standard deviations: position,
+# velocity per frame, acceleration per frame squared
+_START_POSITION = 1e4
 _START_VELOCITY = 1e3
 _START_ACCELERATION = 1e2
 _INDICES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
@@ -49,7 +51,8 @@ def _filter(
     counts = seen.sum(0).clamp(min=1)
     unit = torch.where(seen, variance, torch.zeros_like(variance)).sum(0) / counts
     process = (index**2 * unit)[:, None, None]
-    start = torch.diag(values.new_tensor([1.0, _START_VELOCITY**2, _START_ACCELERATION**2])) * unit[:, None, None]
+    start = torch.diag(values.new_tensor([_START_POSITION, _START_VELOCITY, _START_ACCELERATION]) ** 2)
+    start = start * unit[:, None, None]
     mean, cov = values.new_zeros(series, 3, coords), start
     begun = torch.zeros_like(seen[0])
     predicted_mean, predicted_cov, means, covs = [], [], [], []
