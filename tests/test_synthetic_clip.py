@@ -295,3 +295,16 @@ def test_points_off_the_body_have_no_path():
     xyz, seen = clip.trajectory(points)
     assert xyz.isnan().all()
     assert not seen.any()
+
+
+def test_sift_finds_points_on_the_body():
+    """An independent detector finds at least 150 points on the typical body at 768 x 576 and 7 m."""
+    cv2 = pytest.importorskip("cv2")
+    counts = []
+    for seed, action in enumerate(("shoot", "run", "jump", "pass", "run")):
+        clip = _clip(action, seed=40 + seed, frames=30, noise=SensorNoise(), size=(576, 768))
+        frame = clip.render(15)
+        grey = (255 * frame.rgb.mean(0)).round().to(torch.uint8).numpy()
+        counts.append(len(cv2.SIFT_create().detect(grey, 255 * frame.mask.to(torch.uint8).numpy())))
+    assert torch.tensor(counts).median() >= 150
+    assert min(counts) >= 80

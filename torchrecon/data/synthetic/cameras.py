@@ -144,6 +144,15 @@ def turning_camera(
         focal: pixels; default 2.3 image heights (1.8 m at 7 m: about 340 of 576 pixels), or less where the
             player would leave the image.
         projection: ``pinhole``, ``weak_perspective`` or ``orthographic``.
+
+    Example:
+        >>> import torch
+        >>> from torchrecon.data.synthetic import sample_body, sample_motion
+        >>> g = torch.Generator().manual_seed(0)
+        >>> motion = sample_motion("jump", sample_body(g), frames=10, generator=g)
+        >>> camera = turning_camera(motion, total_turn_deg=90.0, distance=6.0, generator=g)
+        >>> round(float(camera.to_camera(motion.joints)[:, 0, 2].mean()))
+        6
     """
     g = generator
     aim = _aim(motion, follow=True)

@@ -145,6 +145,15 @@ def retarget_joints(
 
     Raises:
         ReconError: a needed joint is not there, or positions are not finite.
+
+    Example:
+        >>> import torch
+        >>> from torchrecon.data.synthetic import sample_body, sample_motion
+        >>> g = torch.Generator().manual_seed(0)
+        >>> source = sample_motion("run", sample_body(g), frames=10, generator=g)
+        >>> motion = retarget_joints(source.joints, source.parents, source.names, sample_body(g), source.fps)
+        >>> motion.joints.shape
+        torch.Size([10, 21, 3])
     """
     if len(names) != joints.shape[1] or len(parents) != joints.shape[1]:
         raise ReconError(f"retarget_joints: {joints.shape[1]} joints, {len(names)} names, {len(parents)} parents")
