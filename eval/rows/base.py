@@ -2,9 +2,9 @@
 
 A row takes the tracks of one sequence and a :class:`Context` and returns points in camera axes. Every monocular
 row of another's style works on :class:`Views`: image positions in the units of one shared rigid factorisation,
-which is also the one source of camera rotations for all of them, so that rows differ in their idea and not in
-their rotations. The sign of depth is that of the shared factorisation, chosen there from the perspective
-residual, for all rows alike.
+which is also the one source of camera rotations for all of them (see ``rotations``), so that rows differ in their
+idea and not in their rotations. The sign of depth is that of the shared factorisation, decided there by perspective,
+for all rows alike.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from eval.rows.rotations import turning_rigid
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.measurement import FilledTracks, Reconstruction, Tracks
 from torchrecon.measurement.camera import normalised_coordinates
@@ -26,7 +27,6 @@ __all__ = [
     "RowOutput",
     "Views",
     "in_camera",
-    "perspective_sign",
     "registered_views",
     "shared_rigid",
     "with_perspective",
@@ -117,34 +117,10 @@ class Views:
 
 
 def shared_rigid(tracks: Tracks, seed: int = 0) -> Reconstruction:
-    """The one source of rotations: rigid factorisation, its mirror chosen by :func:`perspective_sign`."""
-    answer = get_solver("rigid")(tracks, 1, generator=torch.Generator().manual_seed(seed))
-    return answer if perspective_sign(tracks, answer.points3d) > 0 else answer.mirrored()
-
-
-def perspective_sign(tracks: Tracks, points3d: Float[Tensor, "frames points 3"]) -> float:
-    """+1, or -1 where the mirrored shape explains the pinhole views better; +1 without intrinsics.
-
-    Near points look larger than far ones: with ``n`` the normalised image coordinates and X a shape in camera axes,
-    ``n (z + t_z) = (x, y) + (t_x, t_y)`` is linear in the translation of each frame. The sign of z that leaves the
-    smaller residual is right, for any method's shape, without any ground truth.
-    """
-    if tracks.intrinsics is None:
-        return 1.0
-    plane = torch.where(
-        tracks.visible[..., None], normalised_coordinates(tracks.xy, tracks.intrinsics), torch.zeros_like(tracks.xy)
-    )
-    weight = tracks.visible.to(plane.dtype)
-    residuals = []
-    for sign in (1.0, -1.0):
-        target = (points3d[..., :2] - sign * plane * points3d[..., 2:]) * weight[..., None]
-        # Unknown (t_z, t_x, t_y): n t_z - (t_x, t_y) = target; the last two drop out with the frame's mean.
-        count = weight.sum(1).clamp_min(1)[:, None, None]
-        n = (plane - plane.sum(1, keepdim=True) / count) * weight[..., None]
-        b = (target - target.sum(1, keepdim=True) / count) * weight[..., None]
-        away = (n * b).sum((1, 2)) / n.square().sum((1, 2)).clamp_min(torch.finfo(n.dtype).tiny)
-        residuals.append(float((n - b / away[:, None, None]).square().sum()))
-    return 1.0 if residuals[0] <= residuals[1] else -1.0
+    """The one source of rotations: :func:`turning_rigid` for pinhole tracks, else the library's factorisation."""
+    if tracks.intrinsics is not None:
+        return turning_rigid(tracks)
+    return get_solver("rigid")(tracks, 1, generator=torch.Generator().manual_seed(seed))
 
 
 def registered_views(tracks: Tracks, rigid: Reconstruction, depth: Tensor | None = None) -> Views:
