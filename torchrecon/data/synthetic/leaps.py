@@ -131,7 +131,7 @@ def jump(body: Body, t: Float[Tensor, " frames"], generator: torch.Generator | N
     times, swing, flex = [leap.takeoffs[0] - leap.push - leap.rest], [0.05], [0.3]
     for off, land in zip(leap.takeoffs, leap.landings, strict=True):
         times += [off - 0.8 * leap.push, off + 0.02, off + 0.45 * leap.flight, land, land + 0.8 * leap.push]
-        swing += [-back, 0.75 * top, top, 0.6 * top, 0.15]
+        swing += [-back, 0.5 * top, top, 0.65 * top, 0.15]
         flex += [0.25, 0.7, 0.35, 0.6, 0.5]
     times += [times[-1] + 0.5]
     raise_, bend = keys(t, times, [*swing, 0.05]), keys(t, times, [*flex, 0.2])
