@@ -49,9 +49,10 @@ class TrajectoryParams:
         rates: angular velocities of the grid (degrees per second), tried in both senses where the sense matters.
         axes: directions of the turning axis in the image (degrees from the vertical).
         entries: observations per point that the search uses at most; frames are thinned to reach it (count).
-        search_points: longest tracks that the search uses (count).
-        candidates: grid points that are refined (count).
-        iterations: descent steps per candidate (count).
+        grid_points: longest tracks that are scored on the grid (count).
+        search_points: longest tracks that the refinement uses (count).
+        candidates: axes that are refined, each from its best rate (count).
+        iterations: descent steps per round, two rounds per candidate (count).
         drift: standard deviation of the translation about the mean image position of the seen points (rms sizes).
         drift_memory: its time scale (seconds).
         rate_spread: standard deviation of the angular velocity about the grid point (degrees per second).
@@ -65,10 +66,11 @@ class TrajectoryParams:
     default_noise: float = 0.01
     rates: tuple[float, ...] = (25.0, 50.0, 75.0, 100.0, 125.0, 150.0, 200.0)
     axes: tuple[float, ...] = (0.0, 45.0, 90.0, 135.0)
-    entries: int = 20
-    search_points: int = 250
-    candidates: int = 2
-    iterations: int = 25
+    entries: int = 16
+    grid_points: int = 100
+    search_points: int = 200
+    candidates: int = 3
+    iterations: int = 12
     drift: float = 0.3
     drift_memory: float = 0.4
     rate_spread: float = 25.0
@@ -92,9 +94,10 @@ def _centres(data: Observations) -> Tensor:
 
 def _prior(data: Observations, axis: Tensor, params: TrajectoryParams) -> MotionPrior:
     """Rest positions as wide along and across the axis as the image shows them, and one kernel per class."""
+    flat = axis[:2] / axis[:2].norm().clamp_min(1e-6)
     spread = torch.where(data.visible[..., None], data.xy - _centres(data)[:, None], data.xy.new_zeros(()))
     second = torch.einsum("fpa,fpb->ab", spread, spread) / data.visible.sum()
-    along = axis[:2] @ second @ axis[:2]
+    along = flat @ second @ flat
     across = (second.trace() - along).clamp_min(1e-3 * along)
     eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
     rest = across * eye + (along - across) * axis[:, None] * axis
@@ -181,6 +184,16 @@ def _grid(data: Observations, params: TrajectoryParams) -> list[Tensor]:
     return grid
 
 
+def _distinct(velocities: list[Tensor], count: int) -> list[Tensor]:
+    """The first of each axis and sense, best first."""
+    kept: list[Tensor] = []
+    for velocity in velocities:
+        direction = velocity / velocity.norm()
+        if all(float(direction @ other / other.norm()) < 0.99 for other in kept):
+            kept.append(velocity)
+    return kept[:count]
+
+
 def solve_trajectories(
     item: Tracks, rank: int, generator: torch.Generator, params: TrajectoryParams | None = None
 ) -> Reconstruction:
@@ -192,18 +205,23 @@ def solve_trajectories(
     thinned = pack(data, max(1, -(-longest // params.entries)))
     order = torch.argsort(thinned.seen.sum(1), descending=True, stable=True)[: params.search_points]
     search = thinned.select(order)
+    coarse = thinned.select(order[: params.grid_points])
     shift, log_scale = _start(data)
     scored = []
     with torch.no_grad():
         for velocity in _grid(data, params):
             prior = _prior(data, velocity / velocity.norm(), params)
             path = CameraPath(_turning(item.times, velocity), shift, log_scale)
-            scored.append((float(negative_log_likelihood(search, path, prior, noise)), velocity))
+            scored.append((float(negative_log_likelihood(coarse, path, prior, noise)), velocity))
     scored.sort(key=lambda entry: entry[0])
     answers = []
-    for _, velocity in scored[: params.candidates]:
-        prior = _prior(data, velocity / velocity.norm(), params)
-        answers.append((*_refine(search, data, velocity, prior, noise, params), prior))
+    for velocity in _distinct([velocity for _, velocity in scored], params.candidates):
+        speed = velocity
+        # The refined axis may have left that of the grid: a second round measures the body about its own axis.
+        for _ in range(2):
+            prior = _prior(data, speed / speed.norm().clamp_min(1e-9), params)
+            value, speed, path = _refine(search, data, speed, prior, noise, params)
+        answers.append((value, speed, path, prior))
     _, speed, path, prior = min(answers, key=lambda answer: answer[0])
     with torch.no_grad():
         canonical, spread, _ = posterior_points(pack(data), path, prior, noise)
