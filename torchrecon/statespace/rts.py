@@ -54,7 +54,7 @@ def _filter(
     start = torch.diag(values.new_tensor([_START_POSITION, _START_VELOCITY, _START_ACCELERATION]) ** 2)
     start = start * unit[:, None, None]
     mean, cov = values.new_zeros(series, 3, coords), start
-    begun = torch.zeros_like(seen[0])
+    begun, observed = torch.zeros_like(seen[0]), torch.zeros_like(counts)
     predicted_mean, predicted_cov, means, covs = [], [], [], []
     squares, logs, used = values.new_zeros(series), values.new_zeros(series), values.new_zeros(series)
     for frame in range(frames):
@@ -71,14 +71,14 @@ def _filter(
         innovation = clean[frame] - mean[:, 0]
         gain = torch.where(seen[frame], 1 / total, torch.zeros_like(total))[:, None] * cov[:, :, 0]
         # the first innovations only tell how unknown the start was
-        count = seen[frame] & begun & (seen[:frame].sum(0) >= 3)
+        count = seen[frame] & (observed >= 3)
         squares = squares + torch.where(count, (innovation**2).mean(-1) / total, 0.0)
         logs = logs + torch.where(count, total.log(), 0.0)
         used = used + count
         mean = mean + gain[:, :, None] * innovation[:, None, :]
         cov = cov - gain[:, :, None] * cov[:, None, 0, :]
         cov = (cov + cov.transpose(-1, -2)) / 2
-        begun = begun | seen[frame]
+        begun, observed = begun | seen[frame], observed + seen[frame]
         means.append(mean)
         covs.append(cov)
     return predicted_mean, predicted_cov, means, covs, squares, logs, used
@@ -103,10 +103,13 @@ def best_tracking_index(
         (index, factor): one index per series, and what the variances have to be multiplied by.
     """
     steps = [1.0] * (len(values) - 1) if steps is None else steps
-    results = [
-        _filter(values, seen, variance, values.new_full((values.shape[1],), index), steps)[4:] for index in _INDICES
-    ]
-    squares, logs, used = (torch.stack([r[i] for r in results]) for i in range(3))
+    # all candidates in one pass: the recursion over frames is what takes the time
+    copies, series = len(_INDICES), values.shape[1]
+    index = values.new_tensor(_INDICES).repeat_interleave(series)
+    *_, squares, logs, used = _filter(
+        values.repeat(1, copies, 1), seen.repeat(1, copies), variance.repeat(1, copies), index, steps
+    )
+    squares, logs, used = (x.view(copies, series) for x in (squares, logs, used))
     total = used[0].sum()
     if not float(total) > 0:
         return values.new_full((values.shape[1],), _INDICES[len(_INDICES) // 2]), 1.0
