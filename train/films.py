@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -26,7 +25,7 @@ from torchrecon.data.synthetic import (
     static_camera,
     turning_camera,
 )
-from torchrecon.models.recogniser import ReadOut, hold_last, read_out
+from torchrecon.models.recogniser import ReadOut, hold_last, read_out, yaws_of
 
 WINDOW = 32
 """Frames that the recogniser looks at."""
@@ -209,7 +208,8 @@ class Windows(Dataset[tuple[Tensor, int]]):
     def __getitem__(self, index: int) -> tuple[Tensor, int]:
         generator = torch.Generator().manual_seed((self.seed * 10_007 + self.epoch) * 1_000_003 + index)
         film = augment(self.films[index], self.how, generator)
-        yaw = 2 * math.pi * float(torch.rand((), generator=generator))
+        yaws, weights = yaws_of(film.rotations, 60)
+        yaw = float(yaws[torch.multinomial(weights, 1, generator=generator)])
         start = int(torch.randint(max(1, len(film.points3d) - WINDOW + 1), (), generator=generator))
         shown = slice(start, start + WINDOW)
         return hold_last(

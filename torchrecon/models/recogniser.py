@@ -35,9 +35,10 @@ __all__ = [
     "read_out",
     "save_recogniser",
     "weights_hash",
+    "yaws_of",
 ]
 
-_VIEWS = ("across", "side", "top", "camera")
+_VIEWS = ("side", "top", "camera")
 
 
 @dataclass(frozen=True)
@@ -45,22 +46,21 @@ class ReadOut:
     """How a moving shape becomes pictures.
 
     Attributes:
-        views: any of ``across`` (height against depth: the side view from 90 degrees to the camera of each frame),
-            ``side`` (from one world yaw), ``top`` (from above, turned by the world yaw) and ``camera`` (the camera's
-            own view, depth unread: only for the recogniser of 2D views).
+        views: any of ``side`` (from one world yaw), ``top`` (from above, turned by that yaw) and ``camera`` (the
+            camera's own view, depth unread: only for the recogniser of 2D views).
         size: height and width of a picture, pixels.
         extent: half the width of a picture, in rms sizes of the clip.
         sigma: standard deviation of a splatted point, pixels.
         gain: steepness of the occupancy 1 - exp(-gain * density), where density 1 is all points of a frame spread
             evenly over the picture: it makes a limb seen by few points as clear as one seen by many.
-        yaws: how many world yaws, evenly round the circle, a test averages over.
+        yaws: how many world yaws, evenly round the circle, a test averages over (see :func:`yaws_of`).
 
     Example:
         >>> ReadOut(views=("camera",), yaws=1).size
         24
     """
 
-    views: tuple[str, ...] = ("across", "top")
+    views: tuple[str, ...] = ("side", "top")
     size: int = 24
     extent: float = 2.8
     sigma: float = 0.7
@@ -90,8 +90,7 @@ def read_out(
 
     Convention:
         World axes have Y up. At yaw 0 the side view looks along -Z (picture right = +X, picture down = -Y) and the
-        top view has picture right = +X, picture down = +Z. ``yaw`` turns the world about Y before it is seen. The
-        across view has picture right = away from the camera, along the ground.
+        top view has picture right = +X, picture down = +Z. ``yaw`` turns the world about Y before it is seen.
 
     Args:
         points3d: camera axes (x right, y down, z forward), any unit. Entries that are not visible are not read.
@@ -148,6 +147,35 @@ def _weighted_mean(shape: Tensor, weight: Tensor) -> Tensor:
     return (shape * weight[..., None]).sum(-2, keepdim=True) / total
 
 
+def yaws_of(
+    camera_rotations: Float[Tensor, "frames 3 3"], count: int
+) -> tuple[Float[Tensor, " yaws"], Float[Tensor, " yaws"]]:
+    """World yaws to look from, and how much each counts: never the camera's own view.
+
+    The weight of a yaw is the share of the side view's horizontal axis that is depth to the camera, mean over the
+    frames of cos^2 of the angle between the two: 0 for the own view of a camera that stands still, about the same
+    for all yaws if it goes round. The first yaw is the one of largest weight, the others follow evenly.
+
+    Returns:
+        yaws: radians.
+        weights: they sum to 1.
+
+    Example:
+        >>> yaws, weights = yaws_of(torch.eye(3).expand(5, 3, 3), 4)  # a camera that looks along Z
+        >>> [round(math.degrees(yaw)) for yaw in yaws], [round(float(weight), 2) for weight in weights]
+        ([90, 180, 270, 360], [0.5, 0.0, 0.5, 0.0])
+    """
+    axis = camera_rotations[:, 2, ::2].double()
+    axis = axis / axis.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    # Twice the angle, so that opposite directions, which show the same depth, do not cancel.
+    double = torch.stack([axis[:, 0].square() - axis[:, 1].square(), 2 * axis[:, 0] * axis[:, 1]], -1).mean(0)
+    best = torch.atan2(double[1], double[0]) / 2
+    yaws = best + 2 * math.pi * torch.arange(count, dtype=torch.float64, device=axis.device) / count
+    right = torch.stack([yaws.cos(), yaws.sin()], -1)
+    weights = (right @ axis.T).square().mean(-1)
+    return yaws, weights / weights.sum()
+
+
 def hold_last(volume: Float[Tensor, "views frames size size"], window: int) -> Tensor:
     """The volume itself, or, where it is shorter than ``window`` frames, with its last picture held."""
     missing = window - volume.shape[1]
@@ -160,9 +188,6 @@ def _pictures(shape: Tensor, weight: Tensor, rotations: Tensor, params: ReadOut,
     right = cosine * world[..., 0] + sine * world[..., 2]
     towards = cosine * world[..., 2] - sine * world[..., 0]
     planes = {"side": (right, -world[..., 1]), "top": (right, towards), "camera": (shape[..., 0], shape[..., 1])}
-    axis = rotations[..., 2, ::2]  # the optical axis on the ground (X, Z)
-    axis = axis / axis.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    planes["across"] = ((world[..., ::2] * axis[..., None, :]).sum(-1), -world[..., 1])
     xy = torch.stack([torch.stack(planes[view], -1) for view in params.views], -4)
     pixels = (xy / params.extent + 1) * (params.size / 2) - 0.5
     share = weight / weight.sum(-1, keepdim=True).clamp_min(1)
@@ -239,7 +264,7 @@ class WindowScores(NamedTuple):
 
     Attributes:
         predicted: (windows,) index into ``Recogniser.classes``.
-        probabilities: (windows, classes), averaged over yaws.
+        probabilities: (windows, classes), averaged over yaws by their weights.
     """
 
     predicted: Int[Tensor, " windows"]
@@ -276,13 +301,11 @@ def classify_windows(
     shape, weight = _normalised(points3d, visible, recogniser.params)
     rotations = camera_rotations.to(torch.float32)
     dtype = next(recogniser.parameters()).dtype
-    probabilities = []
-    for turn in range(recogniser.params.yaws):
-        yaw = 2 * math.pi * turn / recogniser.params.yaws
-        volume = hold_last(_pictures(shape, weight, rotations, recogniser.params, yaw), window)
+    mean = torch.zeros((), dtype=dtype, device=shape.device)
+    for yaw, share in zip(*yaws_of(camera_rotations, recogniser.params.yaws), strict=True):
+        volume = hold_last(_pictures(shape, weight, rotations, recogniser.params, float(yaw)), window)
         windows = recogniser.look(volume.to(dtype)).unfold(-1, window, stride).transpose(0, 1)
-        probabilities.append(recogniser.name(windows).softmax(-1))
-    mean = torch.stack(probabilities).mean(0)
+        mean = mean + share.to(dtype) * recogniser.name(windows).softmax(-1)
     return WindowScores(mean.argmax(-1), mean)
 
 
