@@ -144,7 +144,7 @@ def factor_model(gaps: Gaps, bases: int) -> FactorModel | None:
     xy, visible = gaps.xy[:, chosen], gaps.visible[:, chosen]
     model = start_factors(xy, visible)
     for _ in range(most):
-        model = fit_factors(grow_factors(model, xy, visible, 3), xy, visible, 30, 1e-3)
+        model = fit_factors(grow_factors(model, xy, visible, 3), xy, visible, 100, 1e-4)
     if len(chosen) < points:
         empty = gaps.xy.new_zeros(points, 3 * most)
         wide = FactorModel(model.rows, model.shift, empty, empty.new_zeros(points, 3 * most, 3 * most), model.noise)

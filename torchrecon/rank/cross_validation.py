@@ -26,7 +26,7 @@ class CrossValidationParams:
 
     share: float = 0.05
     most_points: int = 500
-    iterations: int = 30
+    iterations: int = 60
     patience: int = 2
     trim: float = 0.05
 
