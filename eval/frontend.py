@@ -19,6 +19,7 @@ from typing import Any
 import torch
 
 from torchrecon._typing import Float, Tensor
+from torchrecon.contour.global_motion import background_paths, own_motion
 from torchrecon.contour.mover import find_mover
 from torchrecon.errors import ReconError
 from torchrecon.features import track_points
@@ -92,21 +93,6 @@ def moving_tracks(tracks: Tracks, background: Float[Tensor, "frames 3 3"]) -> tu
     return best
 
 
-def background_paths(frames: Any, masks: list[Tensor]) -> Float[Tensor, "frames 3 3"]:
-    """Homography of each frame to the first, fitted outside the masks."""
-    from torchrecon.contour.global_motion import background_homography, to_gray8
-
-    paths, last = [torch.eye(3, dtype=torch.float64)], None
-    for frame, mask in zip(frames, masks, strict=True):
-        gray = to_gray8(frame)
-        if last is not None:
-            back = background_homography(gray, last, exclude=mask.numpy())
-            step = torch.eye(3, dtype=torch.float64) if back is None else torch.from_numpy(back)
-            paths.append(paths[-1] @ step)
-        last = gray
-    return torch.stack(paths)
-
-
 def draw(frame: Tensor, tracks: Tracks, index: int, path: Path) -> None:
     """Living tracks of one frame with their last ten positions; colour is age."""
     import matplotlib
@@ -147,7 +133,8 @@ def run_clip(name: str, out: Path) -> dict[str, Any]:
     depths = open_depths(folder / "depth") if folder is not None and with_depth else None
     tracks = track_points(frames, masks, fps=frames.fps, depths=depths)
     done = time.process_time()
-    count, start = moving_tracks(tracks, background_paths(frames, masks))
+    paths = background_paths(frames, masks)
+    count, start = moving_tracks(tracks, paths)
     figures: dict[str, Any] = {
         "frames": len(frames),
         "size": list(frames.size),
@@ -157,6 +144,9 @@ def run_clip(name: str, out: Path) -> dict[str, Any]:
         "tracks": tracks.points,
         "tracks_20": int((lengths(tracks) >= LONG).sum()),
         "alive_per_frame": float(tracks.visible.sum(1).double().mean()),
+        "tracks_20_moving": int(
+            ((lengths(tracks) >= LONG) & (own_motion(tracks.xy, tracks.visible, paths) >= MOVES)).sum()
+        ),
         "moving_in_a_common_window": count,
         "window_start": start,
     }

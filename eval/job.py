@@ -155,7 +155,7 @@ class Cache:
     Args:
         folder: made if absent; ``config.json`` in it is the configuration that its contents come from.
         config: everything that a prediction depends on.
-        fresh: throw away what another run left instead of refusing it.
+        fresh: throw away what another configuration left instead of refusing it.
 
     Raises:
         ReconError: the folder was filled under another configuration, or holds files but no configuration.
@@ -171,16 +171,17 @@ class Cache:
         self.folder = Path(folder)
         self.config = plain(config)
         record = self.folder / "config.json"
-        if fresh and record.is_file():  # only a folder that a cache has marked as its own is ever removed
-            shutil.rmtree(self.folder)
         if record.is_file():
             old = read_json(record)
-            if old != self.config:
+            if old != self.config and not fresh:
                 raise ReconError(
                     f"{self.folder}: holds predictions of another configuration "
                     f"({'; '.join(_differences(old, self.config)[:3])}); "
                     "choose another --out or throw it away with --fresh"
                 )
+            if old != self.config:  # only a folder that a cache has marked as its own is ever removed
+                shutil.rmtree(self.folder)
+                write_json(record, self.config)
         elif self.folder.is_dir() and any(self.folder.iterdir()):
             raise ReconError(f"{self.folder}: holds files that no job of this kind has written; choose another --out")
         else:

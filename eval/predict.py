@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from collections.abc import Sequence as List
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from eval.job import Cache, Profile, read_arrays, read_json, run_parallel, write_arrays, write_json
+from eval.job import Cache, Profile, read_arrays, read_json, run_parallel, source_digest, write_arrays, write_json
 from eval.rows import Context, Row, RowOutput, rows_of
 from eval.rows.base import shared_rigid, without_depth
 from eval.rows.template import load_prior
@@ -18,7 +20,18 @@ from torchrecon.errors import ReconError
 from torchrecon.gaps import fill_gaps
 from torchrecon.measurement import Tracks
 
-__all__ = ["Work", "load_row", "predict", "predict_one", "row_path", "tracks_path"]
+__all__ = ["Work", "load_row", "open_caches", "predict", "predict_one", "row_path", "tracks_path"]
+
+
+FILM_CODE = (
+    "eval/sequences.py",
+    *(f"torchrecon/{name}" for name in ("data", "depth", "features", "linalg", "measurement", "noise", "render")),
+    "torchrecon/pipeline/depth.py",
+    "torchrecon/statespace",
+)
+"""What tracks and truth depend on."""
+ROW_CODE = ("eval/predict.py", "eval/rows", "torchrecon")
+"""What a row's answer depends on besides."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +40,7 @@ class Work:
 
     sequence: Sequence
     filming: Filming
+    films: str
     folder: str
     prior: str
     keys: tuple[str, ...]
@@ -36,9 +50,9 @@ class Work:
         return self.sequence.name
 
 
-def tracks_path(folder: Path | str, name: str) -> Path:
+def tracks_path(films: Path | str, name: str) -> Path:
     """Where the tracks and the truth of a sequence are cached."""
-    return Path(folder) / "tracks" / f"{name}.npz"
+    return Path(films) / "tracks" / f"{name}.npz"
 
 
 def row_path(folder: Path | str, key: str, name: str) -> Path:
@@ -65,21 +79,27 @@ def _save_row(path: Path, answer: RowOutput | str) -> None:
 
 def predict_one(work: Work) -> None:
     """Film, track and solve one sequence; what is there already is kept, so a killed run goes on where it was."""
-    profile = Profile()
-    place = tracks_path(work.folder, work.sequence.name)
+    place = tracks_path(work.films, work.sequence.name)
     if not place.is_file():
-        film(work.sequence, work.filming, profile).save(place)
+        filming = Profile()
+        film(work.sequence, work.filming, filming).save(place)
+        write_json(_times(work.films, work.sequence.name), filming.stages)
+    profile = Profile()
     rows = [row for row in rows_of(work.filming.regime) if row.key in work.keys and row.solve is not None]
     rows = [row for row in rows if not row_path(work.folder, row.key, work.sequence.name).is_file()]
     if rows:
         _solve_rows(work, Filmed.load(place), rows, profile)
     # The times stand beside the predictions, so that a run that goes on still reports all that was spent.
-    times = Path(work.folder) / "times" / f"{work.sequence.name}.json"
+    times = _times(work.folder, work.sequence.name)
     if times.is_file():
         earlier = Profile(read_json(times))
         earlier.merge(profile)
         profile = earlier
     write_json(times, profile.stages)
+
+
+def _times(folder: Path | str, name: str) -> Path:
+    return Path(folder) / "times" / f"{name}.json"
 
 
 def _solve_rows(work: Work, filmed: Filmed, rows: List[Row], profile: Profile) -> None:
@@ -110,7 +130,20 @@ def _attempt(row: Row, tracks: Tracks, context: Context) -> RowOutput | str:
         return str(error)
 
 
+def open_caches(
+    out: Path, sequences: List[Sequence], filming: Filming, settings: Mapping[str, Any], fresh: bool
+) -> tuple[Cache, Cache]:
+    """The cache of the films and that of the rows: each knows the code that fills it, so that work on a solver does
+    not throw the films away.
+    """
+    subject = {"sequences": [asdict(item) for item in sequences], "filming": asdict(filming)}
+    films = {**subject, "code of films": source_digest(*FILM_CODE)}
+    rows = {**films, **settings, "code of rows": source_digest(*ROW_CODE)}
+    return Cache(out / "cache" / "films", films, fresh), Cache(out / "cache" / "answers", rows, fresh)
+
+
 def predict(
+    films: Cache,
     cache: Cache,
     sequences: List[Sequence],
     filming: Filming,
@@ -119,11 +152,26 @@ def predict(
     seed: int,
     workers: int,
 ) -> Profile:
-    """Run the first pass over all sequences; returns the times of all of it, earlier runs of this cache included."""
-    works = [Work(item, filming, str(cache.folder), str(prior), keys, seed) for item in sequences]
+    """Run the first pass over all sequences.
+
+    Args:
+        films: cache of tracks and truth.
+        cache: cache of the rows' answers.
+        sequences, filming: what is filmed and how.
+        prior: file of the shape prior.
+        keys: rows that are wanted; none only films.
+        seed: of the rows.
+        workers: processes.
+
+    Returns:
+        The times of all of it, earlier runs of the same caches included.
+    """
+    folders = str(films.folder), str(cache.folder)
+    works = [Work(item, filming, *folders, str(prior), keys, seed) for item in sequences]
     for _ in run_parallel(predict_one, works, workers, "films and rows"):
         pass
     total = Profile()
     for item in sequences:
-        total.merge(Profile(read_json(cache.path("times", f"{item.name}.json"))))
+        total.merge(Profile(read_json(_times(films.folder, item.name))))
+        total.merge(Profile(read_json(_times(cache.folder, item.name))))
     return total

@@ -23,11 +23,11 @@ from torchrecon.data.synthetic import (
     static_camera,
     turning_camera,
 )
-from torchrecon.depth import sample_depth
 from torchrecon.errors import ReconError
 from torchrecon.features import track_points
 from torchrecon.measurement import Tracks
 from torchrecon.noise import hessian_covariance
+from torchrecon.pipeline.depth import body_depth, with_depth
 
 __all__ = ["ACTIONS", "Filmed", "Filming", "Sequence", "mocap_sequences", "synthetic_sequences"]
 
@@ -231,7 +231,8 @@ def film(sequence: Sequence, filming: Filming, profile: Profile) -> Filmed:
             luma = (frame.rgb * frame.rgb.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0)
             grey.append((255 * luma).round().to(torch.uint8))
             if filming.regime == "depth":
-                depth.append(frame.depth)
+                sensed = body_depth(frame.depth, frame.mask, clip.camera.intrinsics)
+                depth.append(torch.where(sensed.body, sensed.depth, torch.nan))
             yield frame.rgb, frame.mask
 
     first, second = tee(rendered())
@@ -244,13 +245,8 @@ def film(sequence: Sequence, filming: Filming, profile: Profile) -> Filmed:
     tracks = replace(tracks, intrinsics=clip.camera.intrinsics, extras=None)
     with profile("covariance and truth"):
         if filming.regime == "depth":
-            tracks = _with_depth(tracks, depth)
+            tracks = with_depth(tracks, depth, clip.camera.intrinsics)
         return Filmed(tracks, _hessian(tracks, grey), *_truth(tracks, clip), clip.camera.rotations)
-
-
-def _with_depth(tracks: Tracks, frames: list[Tensor]) -> Tracks:
-    depth, variance = zip(*(sample_depth(d, xy) for d, xy in zip(frames, tracks.xy, strict=True)), strict=True)
-    return replace(tracks, depth=torch.stack(depth), depth_variance=torch.stack(variance))
 
 
 def _hessian(tracks: Tracks, grey: list[Tensor]) -> Tensor:

@@ -214,7 +214,7 @@ def fake_run(folder: Path) -> tuple[list, dict]:
 def test_scoring_reads_the_cache_and_counts_a_refusal_as_wrong(tmp_path):
     sequences, readers = fake_run(tmp_path)
     rows = tuple(row for row in ROWS if row.key in ("default", "ref5", FLAT.key, VIEWS_2D.key, TRUE_3D.key))
-    table, remarks = table1.score(tmp_path, sequences, rows, readers, seed=0)
+    table, remarks = table1.score(tmp_path, tmp_path, sequences, rows, readers, seed=0)
     by_key = {row["key"]: row for row in table}
     assert load_row(tmp_path, "ref5", sequences[1].name) == "too few tracks"
     assert by_key["ref5"]["cells"]["run"]["error"] == 100.0
