@@ -185,7 +185,7 @@ def negative_log_likelihood(packed: Packed, path: CameraPath, prior: MotionPrior
         noise: standard deviation of the whitened observations.
     """
     rows, target, frame, real = _rows(packed, path, noise)
-    value: Tensor = _Likelihood.apply(rows, target, frame, prior)  # type: ignore[no-untyped-call]
+    value: Tensor = _Likelihood.apply(rows, target, frame, prior)
     return value + real.sum() * math.log(noise)
 
 

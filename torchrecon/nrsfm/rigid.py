@@ -2,6 +2,7 @@
 
 Affine motion, translation and shape are fitted to the seen entries by alternating least squares; the translation is
 part of the fit, so a changing visible subset injects no motion. A metric upgrade then makes the motion orthonormal.
+Tracks with gaps take their camera path from the trajectory likelihood instead.
 The answer is one rigid shape seen from every frame: what a non-rigid solver has to beat. With intrinsics the views
 are taken as weak perspective (one distance per frame). Orthographic views leave a mirror ambiguity, resolved by the
 documented rule; perspective inside the body is not used.
@@ -17,7 +18,9 @@ from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import rotation_from_rows
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.likelihood import MotionPrior, pack, posterior_points
 from torchrecon.nrsfm.observations import Observations, observe
+from torchrecon.nrsfm.trajectory import TrajectoryParams, find_path, place_points
 from torchrecon.nrsfm.upgrade import UpgradeParams, metric_upgrade
 
 __all__ = ["RigidParams", "affine_factors", "rigid"]
@@ -117,6 +120,20 @@ def _euclidean(
     return rotations, scale, points @ torch.linalg.pinv(q).mT
 
 
+def _rigid_with_gaps(data: Observations, rank: int) -> Reconstruction:
+    """One rigid shape from tracks that are born and die.
+
+    Alternation from filled gaps ends far from the views (20 px on bands of 20 frames), so the camera path comes from
+    the likelihood of ``trajectory``; the points are then held rigid under it.
+    """
+    params = TrajectoryParams()
+    path, prior, noise, speed = find_path(data, params)
+    stiff = MotionPrior(prior.rest, torch.zeros_like(prior.kernels[:1]), torch.zeros_like(prior.log_share[:1]))
+    with torch.no_grad():
+        canonical, _, _ = posterior_points(pack(data), path, stiff, noise)
+    return place_points(data, path, canonical, None, speed, rank, params.static_turn)
+
+
 def rigid(
     tracks: Tracks, rank: int | Int[Tensor, "*batch"], *, generator: torch.Generator | None = None
 ) -> Reconstruction:
@@ -142,6 +159,8 @@ def rigid(
 
     def solve_one(item: Tracks, k: int, source: torch.Generator) -> Reconstruction:
         data = observe(item)
+        if not bool(data.visible.all()):
+            return _rigid_with_gaps(data, k)
         motion, shape, converged = affine_factors(data, params)
         rotations, scale, shape = _euclidean(
             motion[..., :3], shape, item.intrinsics is not None, params.upgrade, source

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchrecon._typing import Int, Tensor
+from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, mirror_sign, solve_items, turn_of_view
@@ -32,7 +32,7 @@ from torchrecon.nrsfm.likelihood import (
 )
 from torchrecon.nrsfm.observations import Observations, observe
 
-__all__ = ["TrajectoryParams", "solve_trajectories", "trajectory"]
+__all__ = ["TrajectoryParams", "find_path", "place_points", "solve_trajectories", "trajectory"]
 
 
 @dataclass(frozen=True)
@@ -162,11 +162,11 @@ def _refine(
     def closure() -> Tensor:
         optimiser.zero_grad()
         value = negative_log_likelihood(packed, path()[1], prior, noise) + 0.5 * unknown.square().sum()
-        value.backward()  # type: ignore[no-untyped-call]
+        value.backward()
         return value
 
     with torch.enable_grad():
-        optimiser.step(closure)  # type: ignore[arg-type]
+        optimiser.step(closure)
     with torch.no_grad():
         speed, found = path()
         value = negative_log_likelihood(packed, found, prior, noise) + 0.5 * unknown.square().sum()
@@ -194,12 +194,10 @@ def _distinct(velocities: list[Tensor], count: int) -> list[Tensor]:
     return kept[:count]
 
 
-def solve_trajectories(
-    item: Tracks, rank: int, generator: torch.Generator, params: TrajectoryParams | None = None
-) -> Reconstruction:
-    """Solve one sequence of any visibility; see the module's text. Nothing is random, ``generator`` is not used."""
-    params = params or TrajectoryParams()
-    data = observe(item)
+def find_path(
+    data: Observations, params: TrajectoryParams
+) -> tuple[CameraPath, MotionPrior, float, Float[Tensor, " 3"]]:
+    """The likeliest steady turn: camera path, the prior it was found with, noise factor, angular velocity (rad/s)."""
     noise = params.inflation if data.noise_known else params.default_noise
     longest = int(data.visible.sum(0).max())
     thinned = pack(data, max(1, -(-longest // params.entries)))
@@ -211,7 +209,7 @@ def solve_trajectories(
     with torch.no_grad():
         for velocity in _grid(data, params):
             prior = _prior(data, velocity / velocity.norm(), params)
-            path = CameraPath(_turning(item.times, velocity), shift, log_scale)
+            path = CameraPath(_turning(data.tracks.times, velocity), shift, log_scale)
             scored.append((float(negative_log_likelihood(coarse, path, prior, noise)), velocity))
     scored.sort(key=lambda entry: entry[0])
     answers = []
@@ -223,29 +221,39 @@ def solve_trajectories(
             value, speed, path = _refine(search, data, speed, prior, noise, params)
         answers.append((value, speed, path, prior))
     _, speed, path, prior = min(answers, key=lambda answer: answer[0])
-    with torch.no_grad():
-        canonical, spread, _ = posterior_points(pack(data), path, prior, noise)
-    rotations = path.rotations
+    return path, prior, noise, speed
+
+
+def place_points(
+    data: Observations,
+    path: CameraPath,
+    canonical: Float[Tensor, "frames points 3"],
+    spread: Float[Tensor, "frames points 3 3"] | None,
+    speed: Float[Tensor, " 3"],
+    rank: int,
+    static_turn: float,
+) -> Reconstruction:
+    """Canonical points seen along a camera path, in the container's units, with the status of the view."""
+    item, rotations = data.tracks, path.rotations
     points3d = canonical @ rotations.mT
-    covariance = rotations[:, None] @ spread @ rotations.mT[:, None]
+    covariance = None if spread is None else rotations[:, None] @ spread @ rotations.mT[:, None]
     turn = float(turn_of_view(rotations))
-    rate = math.degrees(float(speed.norm()))
     status = check_size(item, 1)
-    if status is None and turn < params.static_turn and item.depth is None:
+    if status is None and turn < static_turn and item.depth is None:
         status = Status("undetermined", f"the view turns by only {turn:.1f} degrees; depth is not determined")
     if status is None:
-        status = Status("ok", f"steady turn of {rate:.0f} degrees per second, best of {len(scored)} axes and rates")
+        rate = math.degrees(float(speed.norm()))
+        status = Status("ok", f"steady turn of {rate:.0f} degrees per second, the likeliest of all axes and rates")
     if item.intrinsics is not None:
-        centre = points3d.mean(-2)
         distance = torch.exp(-path.log_scale) / data.unit
-        placed = torch.cat([path.translation, distance[:, None]], 1) + centre
+        placed = torch.cat([path.translation, distance[:, None]], 1) + points3d.mean(-2)
         return Reconstruction.from_points(
             points3d * data.length,
             rotations,
             rank=rank,
             status=status,
             translation=placed * data.length,
-            covariance3d=covariance * data.length**2,
+            covariance3d=None if covariance is None else covariance * data.length**2,
             intrinsics=item.intrinsics,
             observed=data.visible,
         )
@@ -259,8 +267,20 @@ def solve_trajectories(
         path.translation,
         rank=rank,
         status=status,
-        covariance3d=covariance * both,
+        covariance3d=None if covariance is None else covariance * both,
     )
+
+
+def solve_trajectories(
+    item: Tracks, rank: int, generator: torch.Generator, params: TrajectoryParams | None = None
+) -> Reconstruction:
+    """Solve one sequence of any visibility; see the module's text. Nothing is random, ``generator`` is not used."""
+    params = params or TrajectoryParams()
+    data = observe(item)
+    path, prior, noise, speed = find_path(data, params)
+    with torch.no_grad():
+        canonical, spread, _ = posterior_points(pack(data), path, prior, noise)
+    return place_points(data, path, canonical, spread, speed, rank, params.static_turn)
 
 
 def trajectory(
