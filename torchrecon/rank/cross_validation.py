@@ -75,7 +75,10 @@ def cross_validate(
     if xy.shape[1] > params.most_points:
         chosen = torch.randperm(xy.shape[1], generator=generator)[: params.most_points].to(xy.device)
         xy, visible = xy[:, chosen], visible[:, chosen]
-    held = visible & (torch.rand(visible.shape, generator=generator) < params.share).to(visible.device)
+    draw = torch.where(visible, torch.rand(visible.shape, generator=generator).to(visible.device), 2.0)
+    # an exact number, so that a short sequence is never judged by nothing
+    count = max(5, round(params.share * int(visible.sum())))
+    held = draw <= draw.flatten().kthvalue(count).values
     train = visible & ~held
     model = start_factors(xy, train)
     squared: list[Tensor] = []
