@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import repeat
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchrecon._typing import Float, Tensor
+from torchrecon._typing import Bool, Float, Tensor
 
-__all__ = ["background_homography", "to_gray8", "warp_image"]
+__all__ = ["background_homography", "background_paths", "own_motion", "to_gray8", "warp_image"]
 
 Image = NDArray[np.generic]
 
@@ -74,3 +76,50 @@ def warp_image(image: Image, matrix: NDArray[np.float64], border: float) -> Imag
         borderValue=(border,) * channels,
     )  # fmt: skip
     return warped
+
+
+def background_paths(
+    frames: Iterable[Float[Tensor, "3 height width"]], masks: Iterable[Bool[Tensor, "height width"]] | None = None
+) -> Float[Tensor, "frames 3 3"]:
+    """Homography of every frame to the first one, fitted to what lies outside the masks; float64.
+
+    Where too few corners agree (blur, a blank wall) the camera is taken to have stood still for that frame.
+    """
+    paths: list[Tensor] = []
+    last: NDArray[np.uint8] | None = None
+    for frame, mask in zip(frames, repeat(None) if masks is None else masks, strict=False):
+        gray = to_gray8(frame)
+        step = None
+        if last is not None:
+            step = background_homography(gray, last, exclude=None if mask is None else mask.numpy())
+        matrix = torch.eye(3, dtype=torch.float64) if step is None else torch.from_numpy(step)
+        paths.append(matrix if not paths else paths[-1] @ matrix)
+        last = gray
+    return torch.stack([path / path[2, 2] for path in paths])
+
+
+def own_motion(
+    xy: Float[Tensor, "frames points 2"], visible: Bool[Tensor, "frames points"], paths: Float[Tensor, "frames 3 3"]
+) -> Float[Tensor, " points"]:
+    """How far each track departs from the background over its life: diagonal of its box in the first frame, pixels.
+
+    A point of the background gives 0 up to noise, so ``own_motion(...) >= 3`` tells the mover's tracks from those
+    that a loose mask let in.
+
+    Args:
+        xy: tracks, pixels; entries that are not visible are not read.
+        visible: which entries are.
+        paths: from :func:`background_paths`.
+
+    Example:
+        >>> import torch
+        >>> xy = torch.tensor([[[0.0, 0.0], [9.0, 9.0]], [[3.0, 4.0], [9.0, 9.0]]])
+        >>> own_motion(xy, torch.ones(2, 2, dtype=torch.bool), torch.eye(3).expand(2, 3, 3)).tolist()
+        [5.0, 0.0]
+    """
+    known = torch.where(visible[..., None], xy, torch.zeros_like(xy)).to(paths)
+    homogeneous = torch.cat([known, torch.ones_like(known[..., :1])], -1) @ paths.mT
+    still = homogeneous[..., :2] / homogeneous[..., 2:]
+    high = torch.where(visible[..., None], still, -torch.inf).amax(0)
+    low = torch.where(visible[..., None], still, torch.inf).amin(0)
+    return torch.where(visible.any(0), (high - low).norm(dim=-1), torch.zeros_like(high[:, 0])).to(xy)

@@ -86,12 +86,13 @@ def _own_motion(
     """
     import cv2
 
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(now, other, None)
+    opencv: Any = cv2  # its stubs leave out the dense flow
+    flow = opencv.DISOpticalFlow_create(opencv.DISOPTICAL_FLOW_PRESET_FAST).calc(now, other, None)
     height, width = now.shape
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float32)
     still = cv2.perspectiveTransform(grid.reshape(1, -1, 2), homography).reshape(height, width, 2) - grid
     length = np.linalg.norm(flow - still, axis=-1)
-    carried = warp_image(other, np.linalg.inv(homography), 0.0).astype(np.float32)
+    carried = warp_image(other, np.linalg.inv(homography).astype(np.float64), 0.0).astype(np.float32)
     change = cv2.GaussianBlur(np.abs(carried - now.astype(np.float32)), (0, 0), 1.0)
     changed = cv2.dilate((change > 6.0).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     moved: NDArray[np.float32] = np.where(changed, length, 0.0).astype(np.float32)
@@ -149,7 +150,7 @@ def _learn(frames: Frames, scale: float, params: MoverParams) -> _Evidence:
         count += 1
     if heat is None:
         raise ReconError("frames: there is none; at least one frame is needed")
-    return _Evidence(heat / count, moving_colours, resting_colours, paths)
+    return _Evidence((heat / count).astype(np.float32), moving_colours, resting_colours, paths)
 
 
 def _largest(mask: NDArray[np.uint8], least: int, weight: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -224,7 +225,7 @@ def find_mover(frames: Frames, params: MoverParams = MoverParams()) -> Iterator[
     least = int(params.min_area * known.heat.size)
     typical = _typical_heat(known.heat, least)
     for index, (image, motion, _) in enumerate(_moving_maps(frames, scale, params)):
-        back = np.linalg.inv(known.paths[index])
+        back = np.linalg.inv(known.paths[index]).astype(np.float64)
         heat = np.asarray(warp_image(known.heat, back, 0.0), dtype=np.float32)
         likely_colour = cv2.GaussianBlur(ratio[_bin(image)].astype(np.float32), (0, 0), 1.5)
         moving = (motion > params.least_motion).astype(np.float32)

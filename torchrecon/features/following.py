@@ -115,9 +115,14 @@ def match_covariance(
     lag_y = (image[:, 1:, :] * image[:, :-1, :]).mean((-1, -2)) / power
     correlation = torch.stack([lag_x, lag_y], -1).clamp(0.0, 0.9)
     fewer = ((1 + correlation) / (1 - correlation)).prod(-1)
-    trace = templates.structure.diagonal(dim1=-2, dim2=-1).sum(-1)
-    ridge = (1e-4 * trace).clamp_min(1e-12)[:, None, None] * _identity(len(residual), residual)
-    inverse = torch.linalg.inv(templates.structure + ridge)
+    # Noise in the template adds to its gradients (half its variance per central difference): without taking that
+    # out again, a noisy window would look better localised than it is.
+    total = templates.weights.sum(-1)
+    weakest = torch.linalg.eigvalsh(templates.structure)[:, 0].clamp_min(0.0)
+    excess = torch.minimum((deviation * templates.deviation) ** 2 / 4 * total, 0.6 * weakest)
+    eye = _identity(len(residual), residual)
+    ridge = (1e-4 * templates.structure.diagonal(dim1=-2, dim2=-1).sum(-1)).clamp_min(1e-12)
+    inverse = torch.linalg.inv(templates.structure + (ridge - excess)[:, None, None] * eye)
     covariance = (noise**2 * fewer)[:, None, None] * (inverse @ templates.structure2 @ inverse)
     values, vectors = torch.linalg.eigh((covariance + covariance.mT) / 2)
     clamped: Tensor = vectors @ torch.diag_embed(values.clamp(0.05**2, float(half) ** 2)) @ vectors.mT

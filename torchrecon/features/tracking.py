@@ -59,9 +59,9 @@ class TrackerParams:
     levels: int = 3
     iterations: int = 6
     alpha: float = 0.8
-    detect_every: int = 4
+    detect_every: int = 3
     max_tracks: int = 400
-    min_distance: float = 5.0
+    min_distance: float = 4.0
     min_length: int = 5
     mask_margin: float = 2.0
     min_correlation: float = 0.7
@@ -70,10 +70,10 @@ class TrackerParams:
     max_disagreement: float = 2.0
     max_backward: float = 0.7
     gate: float = 3.0
-    max_neighbour: float = 0.9
+    max_neighbour: float = 0.75
     local_std: float = 0.25
-    max_std: float = 0.7
-    misfit: float = 0.15
+    max_std: float = 0.75
+    misfit: float = 0.2
     shading_sigma: float = 5.0
     depth_jump: float = 0.08
     sift: SiftParams = field(default_factory=lambda: SiftParams(contrast=0.006))
@@ -108,7 +108,7 @@ def _matched(first: Iterable[Tensor], *others: Iterable[Any] | None) -> Iterator
     end = object()
     count = 0
     for count, frame in enumerate(first, 1):
-        row = [next(stream, end) for stream in streams]
+        row: list[Any] = [next(stream, end) for stream in streams]
         for name, value in zip(("masks", "depths"), row, strict=True):
             if value is end:
                 raise ReconError(f"{name}: end at frame {count - 1}, before the frames; one per frame is needed")
@@ -174,7 +174,8 @@ def track_points(
         elif alive is not None and len(alive.ids):
             alive = advance(alive, last, region, params)
         since += 1
-        if region is not None and (since >= params.detect_every or last is None):
+        nothing = alive is None or not len(alive.ids)
+        if region is not None and (since >= params.detect_every or nothing):
             new = _detect(region, alive, next_id, params)
             if new is not None:
                 next_id += len(new.ids)

@@ -1,0 +1,67 @@
+"""Finding the mover: a textured disc that drifts over a textured wall, before a still and a drifting camera."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from torchrecon.contour import background_paths, find_mover, own_motion
+from torchrecon.errors import ReconError
+
+
+def _texture(height: int, width: int, seed: int) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    image = torch.zeros(1, 3, height, width)
+    for cells in (6, 14):
+        noise = torch.rand(1, 3, height // cells, width // cells, generator=g)
+        image += F.interpolate(noise, size=(height, width), mode="bilinear", align_corners=True)
+    return (image[0] / image.max()).float()
+
+
+def _clip(drift: float, frames: int = 24) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """A reddish disc of radius 26 on a bluish wall of 160 x 220; the camera shifts by ``drift`` px a frame."""
+    wall = _texture(160, 320, 0) * torch.tensor([0.5, 0.7, 1.0], dtype=torch.float32)[:, None, None]
+    skin = _texture(160, 220, 1) * torch.tensor([1.0, 0.55, 0.4], dtype=torch.float32)[:, None, None]
+    y, x = torch.meshgrid(torch.arange(160.0), torch.arange(220.0), indexing="ij")
+    images, masks = [], []
+    for index in range(frames):
+        shift = round(drift * index)
+        centre = 60.0 + 3.0 * index
+        mask = (x - centre) ** 2 + (y - 80.0) ** 2 < 26.0**2
+        carried = torch.roll(skin, round(3.0 * index), 2)
+        images.append(torch.where(mask, carried, wall[:, :, shift : shift + 220]))
+        masks.append(mask)
+    return images, masks
+
+
+@pytest.mark.parametrize("drift", [0.0, 1.0])
+def test_mover_is_found_before_a_still_and_a_drifting_camera(drift):
+    images, truth = _clip(drift)
+    found = list(find_mover(images))
+    assert len(found) == len(images)
+    overlap = [float((a & b).sum() / (a | b).sum()) for a, b in zip(found[2:-2], truth[2:-2], strict=True)]
+    assert min(overlap) > 0.4
+    assert sorted(overlap)[len(overlap) // 2] > 0.7
+
+
+def test_background_path_follows_the_camera_not_the_mover():
+    images, masks = _clip(1.0)
+    paths = background_paths(images, masks)
+    assert float((paths[-1, 0, 2] - (len(images) - 1)).abs()) < 0.6
+    assert float(paths[-1, 1, 2].abs()) < 0.6
+    wall = torch.tensor([[20.0 + 23.0, 20.0]]) - torch.arange(24.0)[:, None, None] * torch.tensor([1.0, 0.0])
+    disc = torch.tensor([[60.0, 80.0]]) + torch.arange(24.0)[:, None, None] * torch.tensor([3.0, 0.0])
+    xy = torch.cat([wall, disc], 1)
+    visible = torch.ones(24, 2, dtype=torch.bool)
+    xy[5, 0], visible[5, 0] = torch.nan, False  # an unseen entry must not be read
+    motion = own_motion(xy, visible, paths)
+    assert float(motion[0]) < 1.0
+    assert float(motion[1]) == pytest.approx(23 * 4.0, abs=1.0)
+
+
+def test_nothing_moves_and_too_few_frames():
+    images, _ = _clip(0.0, frames=2)
+    assert not any(bool(mask.any()) for mask in find_mover([images[0]] * 10))
+    with pytest.raises(ReconError, match="too few"):
+        next(find_mover(images))
