@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Sampler
 
 from torchrecon.data.mocap import MocapClip
 from torchrecon.data.synthetic import (
@@ -197,21 +197,41 @@ def _retimed(film: Film, speed: float) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class Windows(Dataset[tuple[Tensor, int]]):
-    """One varied window of each film; the same (seed, epoch, index) is the same window."""
+    """One varied window of a film, asked for by (epoch, index): the same pair is the same window."""
 
-    def __init__(self, films: list[Film], params: ReadOut, how: Augmentation, seed: int, epoch: int) -> None:
-        self.films, self.params, self.how, self.seed, self.epoch = films, params, how, seed, epoch
+    def __init__(self, films: list[Film], params: ReadOut, how: Augmentation, seed: int) -> None:
+        self.films, self.params, self.how, self.seed = films, params, how, seed
 
     def __len__(self) -> int:
         return len(self.films)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, int]:
-        generator = torch.Generator().manual_seed((self.seed * 10_007 + self.epoch) * 1_000_003 + index)
+    def __getitem__(self, drawn: tuple[int, int]) -> tuple[Tensor, int]:
+        epoch, index = drawn
+        generator = torch.Generator().manual_seed((self.seed * 10_007 + epoch) * 1_000_003 + index)
         film = augment(self.films[index], self.how, generator)
         yaws, weights = yaws_of(film.rotations, 60)
         yaw = float(yaws[torch.multinomial(weights, 1, generator=generator)])
         start = int(torch.randint(max(1, len(film.points3d) - WINDOW + 1), (), generator=generator))
         shown = slice(start, start + WINDOW)
-        return hold_last(
-            read_out(film.points3d, film.visible, film.rotations, self.params, yaw, shown), WINDOW
-        ), film.label
+        volume = read_out(film.points3d, film.visible, film.rotations, self.params, yaw, shown)
+        return hold_last(volume, WINDOW), film.label
+
+
+class Draws(Sampler[tuple[int, int]]):
+    """(epoch, index) of the films that an epoch shows, the trainer sets which; rare classes come as often as others."""
+
+    def __init__(self, films: list[Film]) -> None:
+        labels = torch.tensor([film.label for film in films])
+        self.odds = 1.0 / torch.bincount(labels)[labels]
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return len(self.odds)
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        generator = torch.Generator().manual_seed(self.epoch)
+        for index in torch.multinomial(self.odds, len(self), replacement=True, generator=generator).tolist():
+            yield self.epoch, index

@@ -33,7 +33,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from torch import Tensor
 from torch.nn import functional as F
-from torch.utils.data import DataLoader, WeightedRandomSampler
+from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 import torchrecon
@@ -45,6 +45,7 @@ from train.films import (
     AS_TRACKED,
     MOCAP_CLASSES,
     Augmentation,
+    Draws,
     Film,
     Windows,
     augment,
@@ -123,18 +124,13 @@ class Films(L.LightningDataModule):
         return list(tqdm(made, what, self.validation_films, unit="film"))
 
     def train_dataloader(self) -> DataLoader[tuple[Tensor, Tensor]]:
-        """One varied window per film; rare classes are drawn as often as the others. A new one for every epoch."""
-        epoch = self.trainer.current_epoch
         params = self.trainer.lightning_module.recogniser.params
-        labels = torch.tensor([film.label for film in self.training])
-        odds = 1.0 / torch.bincount(labels)[labels]
-        generator = torch.Generator().manual_seed(epoch)
         return DataLoader(
-            Windows(self.training, params, self.augmentation, self.train_seeds, epoch),
+            Windows(self.training, params, self.augmentation, self.train_seeds),
             batch_size=self.batch_size,
-            sampler=WeightedRandomSampler(odds, len(labels), generator=generator),
+            sampler=Draws(self.training),
             num_workers=self.workers,
-            drop_last=len(labels) > self.batch_size,
+            drop_last=len(self.training) > self.batch_size,
         )
 
 
@@ -158,6 +154,9 @@ class Training(L.LightningModule):
         super().__init__()
         self.recogniser = Recogniser(classes, read_out, width)
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
+
+    def on_train_epoch_start(self) -> None:
+        torch.manual_seed(self.current_epoch)  # dropout depends on the epoch, not on what was drawn before
 
     def training_step(self, batch: tuple[Tensor, Tensor], index: int) -> Tensor:
         volume, label = batch
@@ -220,7 +219,7 @@ def main(arguments: list[str] | None = None) -> int:
         save_config_callback=None,
         args=_plain(sys.argv[1:] if arguments is None else arguments),
         parser_kwargs={"default_config_files": [str(CONFIG)]},
-        trainer_defaults={"logger": False, "deterministic": True, "reload_dataloaders_every_n_epochs": 1},
+        trainer_defaults={"logger": False, "deterministic": True},
     )
     settings = _settings(command)
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
