@@ -16,6 +16,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -261,10 +262,18 @@ class Profile:
         return "\n".join([*lines, f"{'sum':<28}{'':>6}{total / 60:>10.2f}"])
 
 
-def _start_worker() -> None:
+def _start_worker(parent: int) -> None:
     import torch
 
     torch.set_num_threads(1)
+
+    def leave_with_the_job() -> None:
+        # A job that is killed outright cannot stop its workers: they look after themselves.
+        while os.getppid() == parent:
+            time.sleep(2)
+        os._exit(1)
+
+    threading.Thread(target=leave_with_the_job, daemon=True).start()
 
 
 def _call(task: Callable[[Any], Any], item: Any) -> tuple[Any, str | None]:
@@ -296,7 +305,9 @@ def run_parallel(
     from tqdm import tqdm
 
     context = multiprocessing.get_context("spawn")  # a fork of a process that has used torch's thread pool can hang
-    pool = ProcessPoolExecutor(max_workers=workers, mp_context=context, initializer=_start_worker)
+    pool = ProcessPoolExecutor(
+        max_workers=workers, mp_context=context, initializer=_start_worker, initargs=(os.getpid(),)
+    )
     try:
         futures = {pool.submit(_call, task, item): item for item in items}
         with tqdm(total=len(items), desc=label, unit="seq") as bar:
