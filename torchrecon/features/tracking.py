@@ -70,9 +70,9 @@ class TrackerParams:
     max_disagreement: float = 2.0
     max_backward: float = 0.7
     gate: float = 3.0
-    max_neighbour: float = 0.75
+    max_neighbour: float = 0.85
     local_std: float = 0.25
-    max_std: float = 0.75
+    max_std: float = 1.1
     misfit: float = 0.2
     shading_sigma: float = 5.0
     depth_jump: float = 0.08
