@@ -17,7 +17,7 @@ from torchrecon._typing import Float, Int, Tensor
 from torchrecon.errors import ReconError
 from torchrecon.measurement import Reconstruction, Status, Tracks
 
-__all__ = ["check_size", "mirror_sign", "solve_items", "turn_of_view"]
+__all__ = ["check_size", "looks_static", "mirror_sign", "solve_items", "turn_of_view"]
 
 _FIELDS = ("xy", "visible", "covariance", "depth", "depth_variance", "intrinsics", "times")
 _RESULTS = ("points3d", "rotations", "scale", "translation", "covariance3d", "observed")
@@ -115,6 +115,26 @@ def turn_of_view(rotations: Float[Tensor, "*batch frames 3 3"]) -> Float[Tensor,
     cosine = (view * view[..., :1, :]).sum(-1)
     sine = torch.linalg.cross(view, view[..., :1, :].expand_as(view)).square().sum(-1).sqrt()
     return torch.rad2deg(torch.atan2(sine, cosine).amax(-1))
+
+
+def looks_static(centred: Float[Tensor, "frames points 2"]) -> bool:
+    """Whether complete tracks look as if the view never changed.
+
+    Under a fixed view the F x 2P matrix of K bases has rank K and the 2F x P stack has rank 2K; a turning view gives
+    the stack at most 3/2 of the other's rank. Ranks are counted to 1 % and to 0.1 % of the energy, both must agree.
+
+    Example:
+        >>> import torch
+        >>> shape = torch.randn(1, 9, 2, generator=torch.Generator().manual_seed(0))
+        >>> looks_static(shape.expand(12, 9, 2))
+        True
+    """
+    ranks = []
+    for matrix in (centred.mT.flatten(1), centred.mT.flatten(0, 1)):
+        energy = torch.linalg.svdvals(matrix).square()
+        left = energy.flip(0).cumsum(0).flip(0) / energy.sum().clamp_min(torch.finfo(energy.dtype).tiny)
+        ranks.append([int((left > share).sum()) for share in (1e-2, 1e-3)])
+    return all(stack >= 2 * vector for vector, stack in zip(*ranks, strict=True))
 
 
 def check_size(tracks: Tracks, rank: int) -> Status | None:

@@ -18,7 +18,16 @@ import torch
 from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.nrsfm.observations import Observations
 
-__all__ = ["CameraPath", "MotionPrior", "Packed", "matern32", "negative_log_likelihood", "pack", "posterior_points"]
+__all__ = [
+    "CameraPath",
+    "MotionPrior",
+    "Packed",
+    "learn_kernels",
+    "matern32",
+    "negative_log_likelihood",
+    "pack",
+    "posterior_points",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,3 +229,37 @@ def posterior_points(
     before = prior.rest + kernels.diagonal(dim1=1, dim2=2)[..., None, None] * eye
     covariance = before - torch.einsum("pmfi,pmfj->pfij", white, white)
     return mean.transpose(0, 1), covariance.transpose(0, 1), share
+
+
+def learn_kernels(
+    packed: Packed, path: CameraPath, prior: MotionPrior, noise: float, *, weight: float, iterations: int
+) -> MotionPrior:
+    """Kernels and shares of the classes from the tracks themselves, by expectation maximisation.
+
+    Each kernel becomes the mean second moment of the deviations of its points, ``G + G S G / n`` with S the slope of
+    the likelihood, drawn towards the kernel it began with as by ``weight`` coordinates more (inverse Wishart prior).
+
+    Args:
+        weight: of the first kernels (coordinates; a point in a class counts three).
+        iterations: rounds; every one costs about as much as a gradient.
+    """
+    rows, target, frame, _ = _rows(packed, path, noise)
+    frames = prior.kernels.shape[-1]
+    index = (frame[:, :, None] * frames + frame[:, None, :]).flatten()
+    products = rows @ rows.mT
+    first = prior.kernels
+    for _ in range(iterations):
+        parts = [_factor(rows, target, frame, prior, c) for c in range(len(prior.kernels))]
+        joint = torch.stack([part[3] for part in parts]) + prior.log_share[:, None]
+        share = (joint - torch.logsumexp(joint, 0)).exp()
+        kernels = []
+        for c, (_, factor, solved, _) in enumerate(parts):
+            excess = solved[:, :, None] * solved[:, None, :] - torch.cholesky_inverse(factor)
+            slope = rows.new_zeros(frames * frames)
+            slope.index_add_(0, index, (share[c][:, None, None] * excess * products).flatten())
+            kernel, count = prior.kernels[c], 3 * share[c].sum()
+            moved = count * kernel + kernel @ slope.view(frames, frames) @ kernel
+            kernels.append((weight * first[c] + (moved + moved.mT) / 2) / (weight + count))
+        members = share.sum(1) + 1
+        prior = MotionPrior(prior.rest, torch.stack(kernels), torch.log(members / members.sum()))
+    return prior

@@ -9,7 +9,7 @@ import torch
 from torchrecon._typing import Int, Tensor
 from torchrecon.errors import ReconError
 from torchrecon.measurement import Reconstruction, Status, Tracks
-from torchrecon.nrsfm.base import check_size, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
 from torchrecon.nrsfm.logdet import LogDetParams, camera_points, lift_depths, rigid_depths
 from torchrecon.nrsfm.observations import observe
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
@@ -65,8 +65,10 @@ def solve_complete(
     points3d, rotations = points3d * flip, rotations * (flip[:, None] * flip)
     turn = float(turn_of_view(rotations))
     status = check_size(item, rank)
-    if status is None and turn < STATIC_TURN:
-        status = Status("undetermined", f"the view turns by only {turn:.1f} degrees; depth is not determined")
+    if status is None and (turn < STATIC_TURN or looks_static(xy)):
+        status = Status(
+            "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
+        )
     if status is None and not converged:
         status = Status(
             "not_converged", f"the cost still fell after {params.long_iterations} steps from the best start"

@@ -4,9 +4,10 @@ What is sought is the camera path alone; the points are integrated out (see ``li
 angular velocity is looked for on a grid of axes and rates, with rest positions spread about the axis as the image
 shows them: an isotropic prior would charge every point for a depth extent that the body does not have, and so favour
 too slow a turn. The best candidates are refined with a smooth translation. Rotations that are free in every frame
-raise the likelihood and the error together (limbs are explained by wobble), so they are not offered. The points are
-then the posterior mean. With intrinsics the likelihood itself tells the two mirror images apart; without, the
-documented rule picks one. Assumption to keep in mind: the view turns steadily in the axes of the body.
+raise the likelihood and the error together (limbs are explained by wobble), so they are not offered. With the
+camera path found, the kernels are learned from the tracks; the points are then the posterior mean. With intrinsics
+the likelihood itself tells the two mirror images apart; without, the documented rule picks one. Assumption to keep in
+mind: the view turns steadily in the axes of the body.
 Derived here; not a published method.
 """
 
@@ -25,6 +26,7 @@ from torchrecon.nrsfm.likelihood import (
     CameraPath,
     MotionPrior,
     Packed,
+    learn_kernels,
     matern32,
     negative_log_likelihood,
     pack,
@@ -32,7 +34,7 @@ from torchrecon.nrsfm.likelihood import (
 )
 from torchrecon.nrsfm.observations import Observations, observe
 
-__all__ = ["TrajectoryParams", "find_path", "place_points", "solve_trajectories", "trajectory"]
+__all__ = ["TrajectoryParams", "find_path", "place_points", "solve_trajectories", "thinning", "trajectory"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ class TrajectoryParams:
         drift: standard deviation of the translation about the mean image position of the seen points (rms sizes).
         drift_memory: its time scale (seconds).
         rate_spread: standard deviation of the angular velocity about the grid point (degrees per second).
+        kernel_weight: weight of the Matern kernels against the learned ones (coordinates, three per point).
+        kernel_iterations: rounds of learning the kernels (count).
         static_turn: change of view below which depth is called undetermined (degrees).
     """
 
@@ -74,6 +78,8 @@ class TrajectoryParams:
     drift: float = 0.3
     drift_memory: float = 0.4
     rate_spread: float = 25.0
+    kernel_weight: float = 100.0
+    kernel_iterations: int = 5
     static_turn: float = 10.0
 
 
@@ -194,13 +200,17 @@ def _distinct(velocities: list[Tensor], count: int) -> list[Tensor]:
     return kept[:count]
 
 
+def thinning(data: Observations, params: TrajectoryParams) -> int:
+    """Keep every n-th frame so that no track brings more than ``params.entries`` observations to the search."""
+    return max(1, -(-int(data.visible.sum(0).max()) // params.entries))
+
+
 def find_path(
     data: Observations, params: TrajectoryParams
 ) -> tuple[CameraPath, MotionPrior, float, Float[Tensor, " 3"]]:
     """The likeliest steady turn: camera path, the prior it was found with, noise factor, angular velocity (rad/s)."""
     noise = params.inflation if data.noise_known else params.default_noise
-    longest = int(data.visible.sum(0).max())
-    thinned = pack(data, max(1, -(-longest // params.entries)))
+    thinned = pack(data, thinning(data, params))
     order = torch.argsort(thinned.seen.sum(1), descending=True, stable=True)[: params.search_points]
     search = thinned.select(order)
     coarse = thinned.select(order[: params.grid_points])
@@ -279,6 +289,10 @@ def solve_trajectories(
     data = observe(item)
     path, prior, noise, speed = find_path(data, params)
     with torch.no_grad():
+        thinned = pack(data, thinning(data, params))
+        prior = learn_kernels(
+            thinned, path, prior, noise, weight=params.kernel_weight, iterations=params.kernel_iterations
+        )
         canonical, spread, _ = posterior_points(pack(data), path, prior, noise)
     return place_points(data, path, canonical, spread, speed, rank, params.static_turn)
 
