@@ -103,10 +103,11 @@ def test_unseen_entries_are_nan_and_ages_count_from_birth(turning):
 
 def test_new_points_keep_their_distance(turning):
     tracks, _ = turning
-    for index in (0, 8):
+    for index in (0, 6, 9):
         born = tracks.extras["age"][index] == 0
         distance = torch.cdist(tracks.xy[index, born], tracks.xy[index, tracks.visible[index]])
-        assert float(distance[distance > 1e-9].min()) >= TrackerParams().min_distance - 1e-6
+        near = distance[distance > 1e-9]
+        assert len(near) == 0 or float(near.min()) >= TrackerParams().min_distance - 1e-6
 
 
 def test_same_frames_give_the_same_bits():
