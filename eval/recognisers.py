@@ -53,16 +53,28 @@ def readers_of(
                 arguments += ["--data", data, "--exclude", ",".join(subjects)]
             if smoke:
                 arguments += _SMOKE
-            if not path.is_file():
+            if not _usable(path):
                 _train(path, arguments)
             readers[views, fold] = Reader(str(path), weights_hash(load_recogniser(path)))
     return readers
 
 
+def _usable(path: Path) -> bool:
+    """Weights that this version can read; those of an older read-out are trained again."""
+    if not path.is_file():
+        return False
+    try:
+        load_recogniser(path)
+    except ReconError as error:
+        print(f"{error}", flush=True)
+        return False
+    return True
+
+
 def _train(path: Path, arguments: list[str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "train.recogniser", *arguments]
-    print(f"no recogniser at {path}: training one first ({' '.join(command[1:])})", flush=True)
+    print(f"no recogniser for this at {path}: training one first ({' '.join(command[1:])})", flush=True)
     done = subprocess.run(command, cwd=ROOT, check=False)
     if done.returncode != 0:
         raise ReconError(f"python -m train.recogniser ended with exit code {done.returncode}; its message stands above")

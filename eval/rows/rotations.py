@@ -85,8 +85,10 @@ def _fit_translation(s: _State) -> _State:
     eye = torch.eye(3, dtype=points.dtype)
     design = s.rows(eye.expand(*points.shape[:2], 3, 3))
     right = s.rows(points[..., None])[..., 0]
-    gram = torch.einsum("fp,fpai,fpaj->fij", s.weight, design, design) + 1e-9 * eye
-    shift = -torch.linalg.solve(gram, torch.einsum("fp,fpai,fpa->fi", s.weight, design, right)[..., None])[..., 0]
+    # A slight pull to where it was: a frame may see a single point, or none.
+    gram = torch.einsum("fp,fpai,fpaj->fij", s.weight, design, design) + 1e-4 * eye
+    goal = 1e-4 * s.translation - torch.einsum("fp,fpai,fpa->fi", s.weight, design, right)
+    shift = torch.linalg.solve(gram, goal[..., None])[..., 0]
     # The unit of length is free: the mean distance is held, or shape and distance would shrink to nothing together.
     scale = s.translation[:, 2].mean() / shift[:, 2].mean()
     return replace(s, translation=shift * scale, shape=s.shape * scale)
@@ -109,7 +111,8 @@ def _fit_rotations(s: _State, cost: float, p: TurnParams) -> _State:
     # A small turn d moves a point by d x X = -[X]_x d.
     design = torch.cat([s.rows(-skew(points)), s.rows(eye.expand(*points.shape[:2], 3, 3))], -1) / away
     weight = s.weight / (max(cost, 1e-12) * p.together)
-    gram = torch.einsum("fp,fpai,fpaj->fij", weight, design, design) + 1e-9 * torch.eye(6, dtype=points.dtype)
+    gram = torch.einsum("fp,fpai,fpaj->fij", weight, design, design)
+    gram = gram + (1e-6 * gram.diagonal(dim1=-2, dim2=-1).amax()) * torch.eye(6, dtype=points.dtype)
     right = -torch.einsum("fp,fpai,fpa->fi", weight, design, s.residual())
     # Translations drop out frame by frame (Schur complement); what is left is one smooth system of the rotations.
     ahead = torch.linalg.solve(gram[:, 3:, 3:], gram[:, 3:, :3])
