@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from collections.abc import Sequence as List
 from dataclasses import asdict, dataclass, replace
@@ -134,9 +135,16 @@ def open_caches(
     out: Path, sequences: List[Sequence], filming: Filming, settings: Mapping[str, Any], fresh: bool
 ) -> tuple[Cache, Cache]:
     """The cache of the films and that of the rows: each knows the code that fills it, so that work on a solver does
-    not throw the films away.
+    not throw the films away. A sequence's name and the settings below fix its film, so a run with more sequences
+    goes on with the films of one with fewer.
     """
-    subject = {"sequences": [asdict(item) for item in sequences], "filming": asdict(filming)}
+    data = sorted({item.data for item in sequences if item.data is not None})
+    subject = {
+        "data": [hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16] for file in data],
+        "first seed": min(item.seed - item.seed % 1000 for item in sequences),
+        "frames": None if data else max(item.frames for item in sequences),
+        "filming": asdict(filming),
+    }
     films = {**subject, "code of films": source_digest(*FILM_CODE)}
     rows = {**films, **settings, "code of rows": source_digest(*ROW_CODE)}
     return Cache(out / "cache" / "films", films, fresh), Cache(out / "cache" / "answers", rows, fresh)
