@@ -97,6 +97,7 @@ class Config:
         depth: filtering, range box and sampling of measured depth.
         min_track_frames: frames that a track has to last to count as one.
         min_tracks: tracks of that length below which a clip is refused.
+        least_own_motion: pixels by which a track has to move against the background where no masks are given.
     """
 
     tracker: TrackerParams = field(default_factory=TrackerParams)
@@ -104,6 +105,7 @@ class Config:
     depth: DepthParams = field(default_factory=DepthParams)
     min_track_frames: int = 10
     min_tracks: int = 16
+    least_own_motion: float = 3.0
 
 
 def load_config(path: str | os.PathLike[str] | None) -> Config:

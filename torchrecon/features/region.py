@@ -70,7 +70,10 @@ def erode(mask: Bool[Tensor, "height width"], radius: float) -> Bool[Tensor, "he
 
 
 def depth_edges(depth: Float[Tensor, "height width"], jump: float, radius: int) -> Bool[Tensor, "height width"]:
-    """Pixels with a depth step of more than ``jump`` metres within ``radius`` pixels, or without depth.
+    """Pixels with a depth step within ``radius`` pixels, or in a hole of the depth image.
+
+    A step is more than ``jump`` metres, and more than 3 % of the depth: the noise of depth sensors grows with it.
+    A single pixel that the sensor missed among measured ones is no hole.
 
     Example:
         >>> import torch
@@ -81,7 +84,8 @@ def depth_edges(depth: Float[Tensor, "height width"], jump: float, radius: int) 
     side = 2 * radius + 1
     far = F.max_pool2d(torch.where(known, depth, -torch.inf)[None, None], side, 1, radius)
     near = F.max_pool2d(torch.where(known, -depth, -torch.inf)[None, None], side, 1, radius)
-    return ((far + near)[0, 0] > jump) | ~known
+    hole = F.max_pool2d(known.to(depth.dtype)[None, None], 3, 1, 1)[0, 0] == 0
+    return ((far + near)[0, 0] > (-0.03 * near[0, 0]).clamp_min(jump)) | hole
 
 
 def remove_shading(

@@ -14,7 +14,7 @@ import torch
 import torchrecon
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.config import Config, to_mapping
-from torchrecon.contour import find_mover
+from torchrecon.contour import background_paths, find_mover, own_motion
 from torchrecon.errors import ReconError
 from torchrecon.features import track_points
 from torchrecon.io.files import write_json
@@ -68,8 +68,14 @@ def track_video(
         tracks = with_depth(tracks, filtered, intrinsics, config.depth.sample)
     else:
         tracks = track_points(shown, body, config.tracker, frames.fps)
+        if masks is None:
+            # The mask that was found is loose: what it let in of the background does not move by itself.
+            moves = own_motion(tracks.xy, tracks.visible, background_paths(frames)) >= config.least_own_motion
+            long = tracks.visible.sum(-2) >= config.min_track_frames
+            _check_enough(int((moves & long).sum()), config)
+            tracks = tracks.select(points=moves.nonzero()[:, 0])
         tracks = replace(tracks, intrinsics=intrinsics)
-    _check_enough(tracks, config)
+    _check_enough(int((tracks.visible.sum(-2) >= config.min_track_frames).sum()), config)
     return tracks
 
 
@@ -196,13 +202,11 @@ def _follow(items: list[Tensor]) -> Iterator[Tensor]:
         index += 1
 
 
-def _check_enough(tracks: Tracks, config: Config) -> None:
-    long = int((tracks.visible.sum(-2) >= config.min_track_frames).sum())
-    if long < config.min_tracks:
+def _check_enough(found: int, config: Config) -> None:
+    if found < config.min_tracks:
         raise ReconError(
-            f"{long} tracks of {config.min_track_frames} frames or more were found, {config.min_tracks} are needed; "
-            "the clip shows too little texture on the mover, moves too fast, or the mover was not found "
-            "(give --masks)"
+            f"{found} tracks of {config.min_track_frames} frames or more were found on the mover, {config.min_tracks} "
+            "are needed; the clip shows too little texture on it, it moves too fast, or it was not found (give --masks)"
         )
 
 
