@@ -127,11 +127,12 @@ def _rigid_with_gaps(data: Observations, rank: int) -> Reconstruction:
     the likelihood of ``trajectory``; the points are then held rigid under it.
     """
     params = TrajectoryParams()
-    path, prior, noise, speed = find_path(data, params)
+    found = find_path(data, params)
+    prior = found.prior
     stiff = MotionPrior(prior.rest, torch.zeros_like(prior.kernels[:1]), torch.zeros_like(prior.log_share[:1]))
     with torch.no_grad():
-        canonical, _, _ = posterior_points(pack(data), path, stiff, noise)
-    return place_points(data, path, canonical, None, speed, rank, params.static_turn)
+        canonical, _, _ = posterior_points(pack(data), found.path, stiff, found.noise)
+    return place_points(data, found, canonical, None, rank, params)
 
 
 def rigid(
