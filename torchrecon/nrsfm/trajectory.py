@@ -53,7 +53,7 @@ class TrajectoryParams:
         entries: observations per point that the search uses at most; frames are thinned to reach it (count).
         grid_points: longest tracks that are scored on the grid (count).
         search_points: longest tracks that the refinement uses (count).
-        candidates: axes that are refined, each from its best rate (count).
+        candidates: turns of the grid that are refined and learned (count).
         iterations: descent steps per round, two rounds per candidate (count).
         drift: standard deviation of the translation about the mean image position of the seen points (rms sizes).
         drift_memory: its time scale (seconds).
@@ -77,7 +77,7 @@ class TrajectoryParams:
     entries: int = 16
     grid_points: int = 100
     search_points: int = 200
-    candidates: int = 3
+    candidates: int = 4
     iterations: int = 12
     drift: float = 0.3
     drift_memory: float = 0.4
@@ -93,7 +93,8 @@ class FoundPath:
     """The likeliest camera path and what speaks for it.
 
     Attributes:
-        path: pose of every frame; prior: of the points, as it was measured about the turning axis.
+        path: pose of every frame.
+        prior: of the points: rest positions as measured about the turning axis, kernels learned under this path.
         noise: factor on the standard deviation of the observations.
         speed: (3,) angular velocity, radians per second; zero where a fixed view is the likeliest.
         evidence: gain of the best turn over the best fixed view, nats per observation; infinite with measured
@@ -221,11 +222,10 @@ def _grid(data: Observations, params: TrajectoryParams) -> list[Tensor]:
 
 
 def _distinct(velocities: list[Tensor], count: int) -> list[Tensor]:
-    """The first of each axis and sense, best first."""
+    """The first ones, best first, that are not neighbours on the grid."""
     kept: list[Tensor] = []
     for velocity in velocities:
-        direction = velocity / velocity.norm()
-        if all(float(direction @ other / other.norm()) < 0.99 for other in kept):
+        if all(float((velocity - other).norm()) > 0.4 * float(velocity.norm()) for other in kept):
             kept.append(velocity)
     return kept[:count]
 
@@ -257,7 +257,7 @@ def find_path(data: Observations, params: TrajectoryParams) -> FoundPath:
         for _ in range(2):
             prior = _prior(data, speed / speed.norm().clamp_min(1e-9), params)
             value, speed, path = _refine(search, data, speed, prior, noise, params)
-        answers.append((value, speed, path, prior))
+        answers.append(_learned(thinned, value, speed, path, prior, noise, params))
     best = min(answers, key=lambda answer: answer[0])
     evidence = math.inf
     if data.tracks.depth is None:
@@ -266,11 +266,32 @@ def find_path(data: Observations, params: TrajectoryParams) -> FoundPath:
             axis = data.xy.new_tensor([math.sin(math.radians(degrees)), math.cos(math.radians(degrees)), 0.0])
             prior = _prior(data, axis, params)
             still.append((*_refine(search, data, torch.zeros_like(axis), prior, noise, params, turning=False), prior))
-        fixed = min(still, key=lambda answer: answer[0])
-        evidence = (fixed[0] - best[0]) / int(search.seen.sum())
-        best = min(best, fixed, key=lambda answer: answer[0])
-    _, speed, path, prior = best
+        value, speed, path, prior = min(still, key=lambda answer: answer[0])
+        evidence = (value - best[1]) / int(search.seen.sum())
+        if evidence < 0:
+            best = _learned(thinned, value, speed, path, prior, noise, params)
+    _, _, speed, path, prior = best
     return FoundPath(path, prior, noise, speed, evidence)
+
+
+def _learned(
+    packed: Packed,
+    value: float,
+    speed: Tensor,
+    path: CameraPath,
+    prior: MotionPrior,
+    noise: float,
+    params: TrajectoryParams,
+) -> tuple[float, float, Tensor, CameraPath, MotionPrior]:
+    """The answer with kernels learned under its path, led by minus the log-likelihood of all points under them.
+
+    Kernels as given rank the mirror image or half the rate first where the motion of the body is unlike them.
+    """
+    with torch.no_grad():
+        prior = learn_kernels(
+            packed, path, prior, noise, weight=params.kernel_weight, iterations=params.kernel_iterations
+        )
+        return float(negative_log_likelihood(packed, path, prior, noise)), value, speed, path, prior
 
 
 def place_points(
@@ -333,15 +354,7 @@ def solve_trajectories(
     data = observe(item)
     found = find_path(data, params)
     with torch.no_grad():
-        prior = learn_kernels(
-            pack(data, thinning(data, params)),
-            found.path,
-            found.prior,
-            found.noise,
-            weight=params.kernel_weight,
-            iterations=params.kernel_iterations,
-        )
-        canonical, spread, _ = posterior_points(pack(data), found.path, prior, found.noise)
+        canonical, spread, _ = posterior_points(pack(data), found.path, found.prior, found.noise)
     return place_points(data, found, canonical, spread, rank, params)
 
 
