@@ -39,12 +39,14 @@ class Film:
         points3d: (frames, points, 3) camera axes, metres.
         visible: (frames, points) the points that the camera sees.
         rotations: (frames, 3, 3) world -> camera.
+        thickness: (points,) metres, radius of the limb or trunk that a point sits on.
         label: index of the class.
     """
 
     points3d: Tensor
     visible: Tensor
     rotations: Tensor
+    thickness: Tensor
     label: int
 
 
@@ -55,6 +57,10 @@ class Augmentation:
     Attributes:
         points: fewest and most points that are tracked at all.
         crowding: spread (log) of how often a region of the body is tracked: texture is uneven.
+        thin: lowest and highest power of the thickness of a part with which its points are tracked: few windows fit on
+            a thin part, so a tracker has fewer points on a forearm than its area would give.
+        speed: lowest and highest speed in the image against the body's mean, metres per frame, at which every second
+            track is lost.
         life: shortest and longest life of a track, frames; between lives a point is lost for a third of a life.
         jitter: largest noise of a coordinate, rms sizes of the clip.
         offset: largest standing error of a track's depth, rms sizes.
@@ -62,17 +68,29 @@ class Augmentation:
         tempo: largest relative change of speed.
     """
 
-    points: tuple[int, int] = (120, 500)
+    points: tuple[int, int] = (200, 800)
     crowding: float = 0.7
-    life: tuple[int, int] = (12, 60)
+    thin: tuple[float, float] = (0.5, 3.0)
+    speed: tuple[float, float] = (0.012, 0.06)
+    life: tuple[int, int] = (8, 60)
     jitter: float = 0.06
     offset: float = 0.1
     depth_scale: float = 0.15
     tempo: float = 0.15
 
 
-AS_TRACKED = Augmentation(points=(300, 301), life=(15, 40), jitter=0.0, offset=0.0, depth_scale=0.0, tempo=0.0)
-"""Exact 3D at the points and times that a tracker would give: what the validity check looks at."""
+AS_TRACKED = Augmentation(
+    points=(600, 601),
+    thin=(2.0, 2.0),
+    speed=(0.02, 0.02),
+    life=(8, 30),
+    jitter=0.0,
+    offset=0.0,
+    depth_scale=0.0,
+    tempo=0.0,
+)
+"""Exact 3D at the points and times that a tracker would give: what the validity check looks at. Thickness and speed
+are fitted to where the tracker holds points on films of training seeds."""
 
 
 MOCAP_CLASSES = ("shoot", "run", "jump", "pass", "dribble", "walk")
@@ -104,9 +122,11 @@ def film_of(body: Body, motion: Motion, label: int, points: int, turn: float | N
     else:
         camera = turning_camera(motion, total_turn_deg=turn, distance=distance, generator=g)
     clip = SyntheticClip(body, motion, camera)
-    xyz, seen = clip.trajectory(clip.sample_surface(points, g))
+    surface = clip.sample_surface(points, g)
+    xyz, seen = clip.trajectory(surface)
+    thickness = (body.radii.mean(-1) * body.scale.amin(-1))[surface.part]
     ever = seen.any(0)
-    return Film(xyz[:, ever].float(), seen[:, ever], camera.rotations.float(), label)
+    return Film(xyz[:, ever].float(), seen[:, ever], camera.rotations.float(), thickness[ever].float(), label)
 
 
 def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Film:
@@ -123,14 +143,15 @@ def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Fil
 def make_films(make: Callable[[int], Film], seeds: range, workers: int) -> Iterator[Film]:
     """``make`` of each seed, in order."""
     with ProcessPoolExecutor(max(1, workers), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        for points3d, visible, rotations, label in pool.map(partial(_arrays, make), seeds, chunksize=4):
-            yield Film(torch.from_numpy(points3d), torch.from_numpy(visible), torch.from_numpy(rotations), label)
+        for *arrays, label in pool.map(partial(_arrays, make), seeds, chunksize=4):
+            yield Film(*(torch.from_numpy(array) for array in arrays), label)
 
 
-def _arrays(make: Callable[[int], Film], seed: int) -> tuple[Any, Any, Any, int]:
+def _arrays(make: Callable[[int], Film], seed: int) -> tuple[Any, ...]:
     """Arrays travel between processes by value; tensors would hold a file open for each."""
     film = make(seed)
-    return film.points3d.numpy(), film.visible.numpy(), film.rotations.numpy(), film.label
+    tensors = (film.points3d, film.visible, film.rotations, film.thickness)
+    return (*(tensor.numpy() for tensor in tensors), film.label)
 
 
 def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
@@ -146,6 +167,7 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     seeds = middle[torch.randint(count, (6,), generator=generator)]
     region = torch.cdist(middle, seeds).argmin(-1)
     odds = torch.exp(how.crowding * torch.randn(len(seeds), generator=generator))[region]
+    odds = odds * (film.thickness / film.thickness.amax()) ** uniform(*how.thin)
     wanted = min(count, int(uniform(*how.points)))
     chosen = torch.multinomial(odds, wanted, generator=generator)
     points3d, visible = points3d[:, chosen], visible[:, chosen]
@@ -153,6 +175,9 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     life = uniform(*how.life, wanted)
     clock = torch.arange(frames)[:, None] / (life * 4 / 3) + uniform(0, 1, wanted)
     alive = visible & (clock.remainder(1.0) < 0.75)
+    # A tracker loses what is fast in the image against the rest of the body; some windows hold on longer than others.
+    pace = _image_speed(points3d, visible) / uniform(*how.speed)
+    alive = alive & (uniform(0, 1, wanted) < 1 / (1 + pace**3))
     visible = torch.where(alive.any(1, keepdim=True), alive, visible)
 
     if float(uniform(0, 1)) < 0.5:  # the mirror image of body, world and camera together
@@ -166,7 +191,7 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     depth = depth + size * uniform(0, how.offset) * torch.randn(wanted, 1, generator=generator)
     points3d = torch.cat([points3d[..., :2], depth], -1)
     points3d = points3d + size * uniform(0, how.jitter) * torch.randn(points3d.shape, generator=generator)
-    return Film(points3d, visible, rotations, film.label)
+    return replace(film, points3d=points3d, visible=visible, rotations=rotations, thickness=film.thickness[chosen])
 
 
 def flat(film: Film) -> Film:
@@ -178,6 +203,15 @@ def _rms_size(points3d: Tensor, visible: Tensor) -> Tensor:
     weight = visible[..., None].to(points3d.dtype)
     centre = (points3d * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
     return (((points3d - centre).square() * weight).sum() / weight.sum()).sqrt()
+
+
+def _image_speed(points3d: Tensor, visible: Tensor) -> Tensor:
+    """Steps parallel to the image against the mean step of the visible points, (frames, points), unit of the points."""
+    step = points3d[1:, :, :2] - points3d[:-1, :, :2]
+    weight = visible[1:, :, None].to(step.dtype)
+    mean = (step * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
+    pace = (step - mean).norm(dim=-1)
+    return torch.cat([pace[:1], pace])
 
 
 def _retimed(film: Film, speed: float) -> tuple[Tensor, Tensor, Tensor]:
