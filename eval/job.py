@@ -9,13 +9,11 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import math
 import multiprocessing
 import os
 import platform
 import shutil
 import subprocess
-import tempfile
 import threading
 import time
 import traceback
@@ -24,11 +22,12 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
-
-import numpy
+from typing import Any
 
 from torchrecon.errors import ReconError
+from torchrecon.io import files
+from torchrecon.io.files import plain, write_bytes, write_npz
+from torchrecon.io.files import read_npz as read_arrays
 
 __all__ = [
     "Cache",
@@ -47,23 +46,6 @@ __all__ = [
 
 ROOT = Path(__file__).resolve().parents[1]
 _PACKAGES = ("torch", "kornia", "numpy", "scipy", "lightning", "opencv-python-headless")
-
-
-def plain(value: Any) -> Any:
-    """The value as JSON can hold it: numbers unrounded, non-finite numbers as None, paths and tuples plain."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "tolist"):  # tensors, arrays and their scalars
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    raise TypeError(f"{type(value).__name__} has no plain form: {value!r}")
 
 
 def digest(value: Any) -> str:
@@ -85,50 +67,26 @@ def source_digest(*places: str) -> str:
     return total.hexdigest()[:16]
 
 
-@contextmanager
-def _replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A stream whose content takes the name ``path`` only once it is whole."""
+def _in_folder(path: str | os.PathLike[str]) -> Path:
+    """The path, its folder made."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)  # mkstemp makes private files; results are ordinary ones
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    return target
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> Path:
     """Write a text file, atomically."""
-    with _replacing(path) as stream:
-        stream.write(text.encode())
-    return Path(path)
+    return write_bytes(_in_folder(path), text.encode())
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
     """Write named tensors or arrays to a .npz, atomically; None is left out."""
-    kept = {name: numpy.asarray(value) for name, value in arrays.items() if value is not None}
-    with _replacing(path) as stream:
-        numpy.savez_compressed(stream, allow_pickle=False, **kept)
-    return Path(path)
-
-
-def read_arrays(path: str | os.PathLike[str]) -> dict[str, numpy.ndarray]:
-    """Read what :func:`write_arrays` wrote."""
-    with numpy.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+    return write_npz(_in_folder(path), dict(arrays))
 
 
 def write_json(path: str | os.PathLike[str], payload: Any) -> Path:
     """Write the plain form of ``payload``, atomically and unrounded."""
-    return write_text(path, json.dumps(plain(payload), indent=2) + "\n")
+    return files.write_json(_in_folder(path), payload)
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:

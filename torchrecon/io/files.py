@@ -5,37 +5,47 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrecon.measurement._store import write_atomic
+from torchrecon.measurement._store import read_npz, write_atomic, write_npz
 
-__all__ = ["write_bytes", "write_json"]
+__all__ = ["plain", "read_npz", "write_bytes", "write_json", "write_npz"]
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
     """Write ``content`` under a temporary name and move it into place.
 
     Raises:
-        ReconError: the folder does not exist.
+        ReconError: the folder does not exist, or ``path`` is one.
     """
     return write_atomic(path, lambda stream: stream.write(content))
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> Path:
-    """Write JSON, unrounded, atomically; NaN becomes null."""
+    """Write the plain form of ``content`` as JSON, unrounded, atomically."""
     text = json.dumps(plain(content), indent=1, allow_nan=False)
     return write_bytes(path, (text + "\n").encode())
 
 
 def plain(value: Any) -> Any:
-    """Tensors, arrays, tuples and dataclass-free nests as JSON values; non-finite numbers as None."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, dict):
+    """The value as JSON can hold it: numbers unrounded, non-finite numbers as None, paths and tuples plain.
+
+    Example:
+        >>> plain({"a": (1, float("nan")), "b": Path("c")})
+        {'a': [1, None], 'b': 'c'}
+    """
+    if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # tensors, arrays and their scalars
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"{type(value).__name__} has no plain form: {value!r}")
