@@ -89,3 +89,6 @@ def test_a_clip_without_texture_is_refused_with_numbers(tmp_path, capsys):
     assert main(["reconstruct", str(frames), "-o", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert "needed" in error
+    # The refused run left no result, so another attempt at the same folder is not told to use --force.
+    assert main(["reconstruct", str(frames), "-o", str(tmp_path / "out"), "--rank", "2"]) == 2
+    assert "--force" not in capsys.readouterr().err

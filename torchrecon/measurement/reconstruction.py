@@ -64,9 +64,8 @@ class Reconstruction:
         Camera axes: x right, y down, z away from the camera; each frame is centred. ``rotations`` maps canonical
         to camera axes and ``rotations[0]`` is the identity. Without intrinsics lengths are pixels of the tracks,
         with intrinsics metres up to one global scale, with measured depth true metres. For orthographic input the
-        sign of depth is a mirror ambiguity: one sign per sequence, chosen so that, over all frames, the point
-        that lies furthest from the mean shape's image plane, weighted by its depth cubed, is behind the image
-        plane (the third moment of depth is positive); :meth:`mirrored` is the other answer.
+        sign of depth is a mirror ambiguity: one sign per sequence, chosen so that the third moment of depth over all
+        frames and points is positive; :meth:`mirrored` is the other answer. With intrinsics, perspective decides.
 
     Attributes:
         points3d: (*batch, frames, points, 3).

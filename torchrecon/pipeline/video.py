@@ -28,6 +28,7 @@ __all__ = ["reconstruct_video", "track_video"]
 
 Item = TypeVar("Item")
 RUN_FILE = "run.json"
+RESULTS = ("tracks.npz", "reconstruction.npz", "report.json", "views.png")
 
 
 def track_video(
@@ -154,13 +155,14 @@ def _claim(folder: Path, run: Mapping[str, object], force: bool) -> bool:
             earlier = None
         if earlier == json.loads(json.dumps(run)):
             return True
-        if not force:
+        # A run that ended before its first result leaves nothing to protect.
+        if not force and any((folder / name).exists() for name in RESULTS):
             raise ReconError(f"{folder}: holds another run's results; choose another folder or give --force")
     elif any(folder.iterdir()) and not force:
         raise ReconError(
             f"{folder}: is not empty and holds no run of torchrecon; choose another folder or give --force"
         )
-    for name in ("tracks.npz", "reconstruction.npz", "report.json", "views.png"):
+    for name in RESULTS:
         (folder / name).unlink(missing_ok=True)
     write_json(record, run)
     return False
