@@ -7,11 +7,13 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from torchrecon.data.synthetic import ACTIONS
 from torchrecon.errors import ReconError
 from torchrecon.models.recogniser import (
     ReadOut,
@@ -23,6 +25,8 @@ from torchrecon.models.recogniser import (
     weights_hash,
     yaws_of,
 )
+from torchrecon.models.views import settle
+from train.films import AS_TRACKED, Film, augment
 
 ROOT = Path(__file__).parents[1]
 VIEWS = ReadOut()
@@ -115,6 +119,36 @@ def test_camera_that_stands_still_is_never_looked_through(generator):
     torch.testing.assert_close(even, torch.full((8,), 1 / 8))
 
 
+def test_how_densely_points_lie_changes_nearly_nothing(generator):
+    points, visible, rotations = _clip(generator)
+    visible = torch.ones_like(visible)
+    upper = points[:, points[0, :, 1] < points[0, :, 1].median()]
+    crowd = [upper + 0.01 * torch.randn(upper.shape, generator=generator) for _ in range(10)]
+    crowded = torch.cat([points, *crowd], 1)
+    expected = read_out(points, visible, rotations, VIEWS)
+    volume = read_out(crowded, torch.ones(crowded.shape[:2], dtype=torch.bool), rotations, VIEWS)
+    assert (volume - expected).abs().sum() < 0.25 * expected.sum()
+
+
+def test_centre_stays_where_it_is_as_points_come_and_go(generator):
+    points, _, rotations = _clip(generator, frames=30, points=200)
+    born = 30 * torch.rand(200, generator=generator) - 8
+    clock = torch.arange(30)[:, None]
+    visible = (clock >= born) & (clock < born + 8)
+    visible &= (clock % 10 < 5) | (points[0, :, 1] < 0)  # the lower half comes and goes
+
+    def sway(anchor):
+        settled = settle(points, visible, rotations, ReadOut(anchor=anchor))
+        world = points @ rotations
+        order = visible.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[:, : settled.world.shape[1]]
+        scale = (world[0, visible[0]].std(0) / settled.world[0, : visible[0].sum()].std(0)).mean()
+        there = world.gather(1, order[..., None].expand(-1, -1, 3)) / scale
+        shown = settled.weight > 0
+        return torch.stack([(a - b)[c].mean(0) for a, b, c in zip(there, settled.world, shown, strict=True)]).std(0)
+
+    assert sway(0.003)[1] < 0.25 * sway(100.0)[1]
+
+
 def test_flat_points_do_not_pass_for_a_body(generator):
     points, visible, rotations = _clip(generator)
     flat = points * torch.tensor([1.0, 1.0, 0.0])
@@ -152,6 +186,22 @@ def test_bad_input_is_named(generator):
         read_out(points, torch.zeros_like(visible), rotations)
     with pytest.raises(ReconError, match="views"):
         ReadOut(views=("front",))
+
+
+def test_film_shows_what_is_tracked_more_or_all(generator):
+    points, _, rotations = _clip(generator, frames=20, points=100)
+    visible = torch.ones(20, 100, dtype=torch.bool)
+    film = Film(points.float(), visible, rotations.float(), torch.full((100,), 0.1), 0)
+    seen = []
+    for shown in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
+        how = replace(AS_TRACKED, points=(50, 51), life=(6, 9), speed=(1.0, 1.0), shown=shown)
+        seen.append(augment(film, how, torch.Generator().manual_seed(0)).visible)
+    tracked, held, always = seen
+    starts = tracked & ~torch.cat([torch.zeros(1, tracked.shape[1], dtype=torch.bool), tracked[:-1]])
+    assert tracked.sum() / starts.sum() >= AS_TRACKED.shortest[0]
+    assert always.all()
+    assert (held | ~tracked).all()
+    assert tracked.sum() < held.sum() <= always.sum()
 
 
 def test_overfits_eight_clips(generator):
@@ -219,5 +269,5 @@ def test_training_job_ends_with_weights_and_does_nothing_twice(tmp_path):
     run = subprocess.run([sys.executable, "-c", twice], cwd=ROOT, capture_output=True, text=True, env=environment)
     assert run.returncode == 0, run.stderr[-2000:]
     assert run.stdout.count("wrote") == run.stdout.count("already there") == 1
-    assert load_recogniser(out).classes[:4] == ("shoot", "run", "jump", "pass")
+    assert load_recogniser(out).classes == (*ACTIONS, "flat")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["recogniser.json", "recogniser.safetensors"]

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 from torch.utils.data import Dataset, Sampler
 
 from torchrecon.data.mocap import MocapClip
@@ -25,7 +26,7 @@ from torchrecon.data.synthetic import (
     static_camera,
     turning_camera,
 )
-from torchrecon.models.recogniser import ReadOut, hold_last, read_out, yaws_of
+from torchrecon.models.views import ReadOut, hold_last, pictures, settle, yaws_of
 
 WINDOW = 32
 """Frames that the recogniser looks at."""
@@ -62,21 +63,33 @@ class Augmentation:
         speed: lowest and highest speed in the image against the body's mean, metres per frame, at which every second
             track is lost.
         life: shortest and longest life of a track, frames; between lives a point is lost for a third of a life.
+        shortest: fewest and most frames that a track must live to be one: a limb that is fast nearly always has none.
+        shown: odds that a film shows each point while it is tracked, for a while before and after too, or always:
+            a method may say where a point is that the camera does not see.
+        hold: longest "while before and after", frames.
         jitter: largest noise of a coordinate, rms sizes of the clip.
         offset: largest standing error of a track's depth, rms sizes.
         depth_scale: largest relative error of the scale of depth.
         tempo: largest relative change of speed.
+        flat: odds that a variation has no depth to speak of and is shown as the distractor class ``flat``: what can
+            be read without depth must not be what the recogniser reads. Not for the recogniser of 2D views.
+        flat_depth: largest share of its depth that a flat variation keeps.
     """
 
-    points: tuple[int, int] = (200, 800)
-    crowding: float = 0.7
-    thin: tuple[float, float] = (0.5, 3.0)
-    speed: tuple[float, float] = (0.012, 0.06)
+    points: tuple[int, int] = (150, 600)
+    crowding: float = 1.0
+    thin: tuple[float, float] = (0.5, 4.0)
+    speed: tuple[float, float] = (0.007, 0.06)
     life: tuple[int, int] = (8, 60)
+    shortest: tuple[int, int] = (1, 8)
+    shown: tuple[float, float, float] = (0.5, 0.25, 0.25)
+    hold: int = 16
     jitter: float = 0.06
     offset: float = 0.1
     depth_scale: float = 0.15
     tempo: float = 0.15
+    flat: float = 0.12
+    flat_depth: float = 0.25
 
 
 AS_TRACKED = Augmentation(
@@ -84,6 +97,8 @@ AS_TRACKED = Augmentation(
     thin=(2.0, 2.0),
     speed=(0.02, 0.02),
     life=(8, 30),
+    shortest=(5, 5),
+    shown=(1.0, 0.0, 0.0),
     jitter=0.0,
     offset=0.0,
     depth_scale=0.0,
@@ -92,6 +107,9 @@ AS_TRACKED = Augmentation(
 """Exact 3D at the points and times that a tracker would give: what the validity check looks at. Thickness and speed
 are fitted to where the tracker holds points on films of training seeds."""
 
+
+FLAT_CLASS = "flat"
+"""The distractor class of shapes without depth, the last of the recogniser of 3D shapes."""
 
 MOCAP_CLASSES = ("shoot", "run", "jump", "pass", "dribble", "walk")
 """Of real motion; dribble and walk are the distractors."""
@@ -164,7 +182,7 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     frames, count = visible.shape
 
     middle = points3d[frames // 2]
-    seeds = middle[torch.randint(count, (6,), generator=generator)]
+    seeds = middle[torch.randint(count, (12,), generator=generator)]
     region = torch.cdist(middle, seeds).argmin(-1)
     odds = torch.exp(how.crowding * torch.randn(len(seeds), generator=generator))[region]
     odds = odds * (film.thickness / film.thickness.amax()) ** uniform(*how.thin)
@@ -178,7 +196,11 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     # A tracker loses what is fast in the image against the rest of the body; some windows hold on longer than others.
     pace = _image_speed(points3d, visible) / uniform(*how.speed)
     alive = alive & (uniform(0, 1, wanted) < 1 / (1 + pace**3))
+    alive = _lasting(alive, int(torch.randint(how.shortest[0], how.shortest[1] + 1, (), generator=generator)))
     visible = torch.where(alive.any(1, keepdim=True), alive, visible)
+    kept = visible.any(0)
+    points3d, visible, wanted, chosen = points3d[:, kept], visible[:, kept], int(kept.sum()), chosen[kept]
+    visible = _held(visible, how, generator)
 
     if float(uniform(0, 1)) < 0.5:  # the mirror image of body, world and camera together
         mirror = torch.tensor([-1.0, 1.0, 1.0])
@@ -194,9 +216,26 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     return replace(film, points3d=points3d, visible=visible, rotations=rotations, thickness=film.thickness[chosen])
 
 
-def flat(film: Film) -> Film:
-    """The same film with depth unknown: zero in camera axes."""
-    return replace(film, points3d=film.points3d * torch.tensor([1.0, 1.0, 0.0]))
+def _lasting(alive: Tensor, shortest: int) -> Tensor:
+    """Without the lives that are shorter than ``shortest`` frames."""
+    alive = F.pad(alive.T.float(), (shortest - 1, shortest - 1))
+    whole = -F.max_pool1d(-alive, shortest, stride=1)  # 1 where a stretch of that length begins
+    return F.max_pool1d(whole, shortest, stride=1).T > 0
+
+
+def _held(visible: Tensor, how: Augmentation, generator: torch.Generator) -> Tensor:
+    """The entries that a method would stand for: those tracked, some more around them, or all."""
+    kind = int(torch.multinomial(torch.tensor(how.shown), 1, generator=generator))
+    hold = (0, int(torch.randint(1, how.hold + 1, (), generator=generator)), len(visible))[kind]
+    grown = F.max_pool1d(visible.T.float(), 2 * hold + 1, stride=1, padding=hold) if hold < len(visible) else None
+    return torch.ones_like(visible) if grown is None else grown.T > 0
+
+
+def flat(film: Film, share: float = 0.0) -> Film:
+    """The same film with a share of its depth, about the mean of each frame; 0: with depth unknown."""
+    depth = film.points3d[..., 2:]
+    depth = share * (depth - depth.mean(1, keepdim=True))
+    return replace(film, points3d=torch.cat([film.points3d[..., :2], depth], -1))
 
 
 def _rms_size(points3d: Tensor, visible: Tensor) -> Tensor:
@@ -230,25 +269,42 @@ def _retimed(film: Film, speed: float) -> tuple[Tensor, Tensor, Tensor]:
     return world @ rotations.transpose(-1, -2), film.visible[nearest], rotations
 
 
-class Windows(Dataset[tuple[Tensor, int]]):
-    """One varied window of a film, asked for by (epoch, index): the same pair is the same window."""
+class Windows(Dataset[tuple[Tensor, Tensor]]):
+    """Windows of one variation of a film, asked for by (epoch, index): the same pair is the same windows.
 
-    def __init__(self, films: list[Film], params: ReadOut, how: Augmentation, seed: int) -> None:
-        self.films, self.params, self.how, self.seed = films, params, how, seed
+    Each starts at another frame and is seen from another yaw; to settle the shape costs more than to draw it.
+    """
+
+    def __init__(
+        self,
+        films: list[Film],
+        params: ReadOut,
+        how: Augmentation,
+        windows: int,
+        seed: int,
+        flat_label: int | None = None,
+    ) -> None:
+        self.films, self.params, self.how, self.windows, self.seed = films, params, how, windows, seed
+        self.flat_label = flat_label
 
     def __len__(self) -> int:
         return len(self.films)
 
-    def __getitem__(self, drawn: tuple[int, int]) -> tuple[Tensor, int]:
+    def __getitem__(self, drawn: tuple[int, int]) -> tuple[Tensor, Tensor]:
         epoch, index = drawn
         generator = torch.Generator().manual_seed((self.seed * 10_007 + epoch) * 1_000_003 + index)
         film = augment(self.films[index], self.how, generator)
+        label = film.label
+        if self.flat_label is not None and float(torch.rand((), generator=generator)) < self.how.flat:
+            film = flat(film, self.how.flat_depth * float(torch.rand((), generator=generator)))
+            label = self.flat_label
+        settled = settle(film.points3d, film.visible, film.rotations, self.params)
         yaws, weights = yaws_of(film.rotations, 60)
-        yaw = float(yaws[torch.multinomial(weights, 1, generator=generator)])
-        start = int(torch.randint(max(1, len(film.points3d) - WINDOW + 1), (), generator=generator))
-        shown = slice(start, start + WINDOW)
-        volume = read_out(film.points3d, film.visible, film.rotations, self.params, yaw, shown)
-        return hold_last(volume, WINDOW), film.label
+        volumes = []
+        for yaw in yaws[torch.multinomial(weights, self.windows, replacement=True, generator=generator)].tolist():
+            start = int(torch.randint(max(1, len(film.points3d) - WINDOW + 1), (), generator=generator))
+            volumes.append(hold_last(pictures(settled, self.params, yaw, slice(start, start + WINDOW)), WINDOW))
+        return torch.stack(volumes), torch.full((self.windows,), label)
 
 
 class Draws(Sampler[tuple[int, int]]):

@@ -10,10 +10,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import math
 import os
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from torch import nn
 
 from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.errors import ReconError
-from torchrecon.render.splat import splat
+from torchrecon.models.views import ReadOut, hold_last, pictures, read_out, settle, yaws_of
 
 __all__ = [
     "ReadOut",
@@ -38,162 +37,7 @@ __all__ = [
     "yaws_of",
 ]
 
-_VIEWS = ("side", "top", "camera")
-
-
-@dataclass(frozen=True)
-class ReadOut:
-    """How a moving shape becomes pictures.
-
-    Attributes:
-        views: any of ``side`` (from one world yaw), ``top`` (from above, turned by that yaw) and ``camera`` (the
-            camera's own view, depth unread: only for the recogniser of 2D views).
-        size: height and width of a picture, pixels.
-        extent: half the width of a picture, in rms sizes of the clip.
-        sigma: standard deviation of a splatted point, pixels.
-        gain: steepness of the occupancy 1 - exp(-gain * density), where density 1 is all points of a frame spread
-            evenly over the picture: it makes a limb seen by few points as clear as one seen by many.
-        yaws: how many world yaws, evenly round the circle, a test averages over (see :func:`yaws_of`).
-
-    Example:
-        >>> ReadOut(views=("camera",), yaws=1).size
-        24
-    """
-
-    views: tuple[str, ...] = ("side", "top")
-    size: int = 24
-    extent: float = 2.8
-    sigma: float = 0.7
-    gain: float = 0.15
-    yaws: int = 4
-
-    def __post_init__(self) -> None:
-        if not self.views or any(view not in _VIEWS for view in self.views):
-            raise ReconError(f"ReadOut: views {self.views} must be one or more of {_VIEWS}")
-        if min(self.size, self.extent, self.sigma, self.gain, self.yaws) <= 0:
-            raise ReconError(f"ReadOut: every number must be positive, got {self}")
-
-
-def read_out(
-    points3d: Float[Tensor, "*batch frames points 3"],
-    visible: Bool[Tensor, "*batch frames points"],
-    camera_rotations: Float[Tensor, "*batch frames 3 3"],
-    params: ReadOut = ReadOut(),
-    yaw: float = 0.0,
-    frames: slice = slice(None),
-) -> Float[Tensor, "*batch views shown size size"]:
-    """Turn a moving shape into pictures over time, the same way for every method and for the truth.
-
-    Each frame is centred at the geometric median of its observed points, the clip is divided by its rms size, the
-    camera's rotations bring it to world axes, and each view is splatted. Global scale and a translation of each
-    frame change nothing.
-
-    Convention:
-        World axes have Y up. At yaw 0 the side view looks along -Z (picture right = +X, picture down = -Y) and the
-        top view has picture right = +X, picture down = +Z. ``yaw`` turns the world about Y before it is seen.
-
-    Args:
-        points3d: camera axes (x right, y down, z forward), any unit. Entries that are not visible are not read.
-        visible: the observed entries.
-        camera_rotations: world -> camera, of the film.
-        yaw: radians.
-        frames: which frames to show; the rms size is always that of the whole clip.
-
-    Returns:
-        float32 occupancy in [0, 1); a frame without observed points is empty.
-
-    Raises:
-        ReconError: an observed entry is not finite, or nothing is observed.
-
-    Example:
-        >>> points = torch.rand(5, 20, 3)
-        >>> read_out(points, torch.ones(5, 20, dtype=torch.bool), torch.eye(3).expand(5, 3, 3)).shape
-        torch.Size([2, 5, 24, 24])
-    """
-    shape, weight = _normalised(points3d, visible, params)
-    rotations = camera_rotations.to(torch.float32)
-    return _pictures(shape[..., frames, :, :], weight[..., frames, :], rotations[..., frames, :, :], params, yaw)
-
-
-def _normalised(points3d: Tensor, visible: Tensor, params: ReadOut) -> tuple[Tensor, Tensor]:
-    """Centred frames of clip rms size 1, zeros where unobserved, and the weight 0 or 1 of each entry; float32."""
-    if params.views == ("camera",):  # depth must not leak in through centre and size either
-        points3d = torch.cat([points3d[..., :2], torch.zeros_like(points3d[..., 2:])], -1)
-    shape = torch.where(visible[..., None], points3d, torch.zeros_like(points3d)).to(torch.float32)
-    if not torch.isfinite(shape).all():
-        where = torch.nonzero(~torch.isfinite(shape).all(-1))[0].tolist()
-        raise ReconError(f"read_out: points3d at index {where} is marked visible but not finite; unmark or fill it")
-    weight = visible.to(torch.float32)
-    total = weight.sum((-1, -2))
-    if (total == 0).any():
-        raise ReconError("read_out: nothing is visible in the clip; a shape needs observed points")
-    # The mean first: it makes a translation of any size harmless to the float32 steps that follow.
-    centre = _weighted_mean(shape, weight)
-    shape = shape - centre
-    size = ((shape.square().sum(-1) * weight).sum((-1, -2)) / total).sqrt()[..., None, None, None]
-    shape = shape / size.clamp_min(torch.finfo(torch.float32).tiny)
-    # Weiszfeld's steps to the geometric median: stray points, which some methods have and others not, move it
-    # little, and unlike a median per axis it turns with the body.
-    centre = torch.zeros_like(centre)
-    for _ in range(5):
-        distance = (shape - centre).square().sum(-1).add(1e-4).sqrt()
-        centre = _weighted_mean(shape, weight / distance)
-    return torch.where(visible[..., None], shape - centre, torch.zeros_like(shape)), weight
-
-
-def _weighted_mean(shape: Tensor, weight: Tensor) -> Tensor:
-    """(*batch, frames, 1, 3); zero in a frame without weight."""
-    total = weight.sum(-1)[..., None, None].clamp_min(torch.finfo(torch.float32).tiny)
-    return (shape * weight[..., None]).sum(-2, keepdim=True) / total
-
-
-def yaws_of(
-    camera_rotations: Float[Tensor, "frames 3 3"], count: int
-) -> tuple[Float[Tensor, " yaws"], Float[Tensor, " yaws"]]:
-    """World yaws to look from, and how much each counts: never the camera's own view.
-
-    The weight of a yaw is the share of the side view's horizontal axis that is depth to the camera, mean over the
-    frames of cos^2 of the angle between the two: 0 for the own view of a camera that stands still, about the same
-    for all yaws if it goes round. The first yaw is the one of largest weight, the others follow evenly.
-
-    Returns:
-        yaws: radians.
-        weights: they sum to 1.
-
-    Example:
-        >>> yaws, weights = yaws_of(torch.eye(3).expand(5, 3, 3), 4)  # a camera that looks along Z
-        >>> [round(math.degrees(yaw)) for yaw in yaws], [round(float(weight), 2) for weight in weights]
-        ([90, 180, 270, 360], [0.5, 0.0, 0.5, 0.0])
-    """
-    axis = camera_rotations[:, 2, ::2].double()
-    axis = axis / axis.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    # Twice the angle, so that opposite directions, which show the same depth, do not cancel.
-    double = torch.stack([axis[:, 0].square() - axis[:, 1].square(), 2 * axis[:, 0] * axis[:, 1]], -1).mean(0)
-    best = torch.atan2(double[1], double[0]) / 2
-    yaws = best + 2 * math.pi * torch.arange(count, dtype=torch.float64, device=axis.device) / count
-    right = torch.stack([yaws.cos(), yaws.sin()], -1)
-    weights = (right @ axis.T).square().mean(-1)
-    return yaws, weights / weights.sum()
-
-
-def hold_last(volume: Float[Tensor, "views frames size size"], window: int) -> Tensor:
-    """The volume itself, or, where it is shorter than ``window`` frames, with its last picture held."""
-    missing = window - volume.shape[1]
-    return volume if missing <= 0 else torch.cat([volume, volume[:, -1:].expand(-1, missing, -1, -1)], 1)
-
-
-def _pictures(shape: Tensor, weight: Tensor, rotations: Tensor, params: ReadOut, yaw: float) -> Tensor:
-    world = shape @ rotations  # rows: R^T x for each point
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    right = cosine * world[..., 0] + sine * world[..., 2]
-    towards = cosine * world[..., 2] - sine * world[..., 0]
-    planes = {"side": (right, -world[..., 1]), "top": (right, towards), "camera": (shape[..., 0], shape[..., 1])}
-    xy = torch.stack([torch.stack(planes[view], -1) for view in params.views], -4)
-    pixels = (xy / params.extent + 1) * (params.size / 2) - 0.5
-    share = weight / weight.sum(-1, keepdim=True).clamp_min(1)
-    share = share.unsqueeze(-3).expand(pixels.shape[:-1])
-    density = splat(pixels, share, (params.size, params.size), params.sigma) * params.size**2
-    return 1 - torch.exp(-params.gain * density)
+_READ_OUT = ReadOut()
 
 
 class Recogniser(nn.Module):
@@ -212,7 +56,7 @@ class Recogniser(nn.Module):
         torch.Size([4, 2])
     """
 
-    def __init__(self, classes: tuple[str, ...], params: ReadOut = ReadOut(), width: int = 16) -> None:
+    def __init__(self, classes: tuple[str, ...], params: ReadOut = _READ_OUT, width: int = 16) -> None:
         super().__init__()
         if params.size % 8:
             raise ReconError(f"Recogniser: ReadOut.size {params.size} must be divisible by 8")
@@ -298,12 +142,11 @@ def classify_windows(
         >>> scores.probabilities.shape
         torch.Size([3, 2])
     """
-    shape, weight = _normalised(points3d, visible, recogniser.params)
-    rotations = camera_rotations.to(torch.float32)
+    settled = settle(points3d, visible, camera_rotations, recogniser.params)
     dtype = next(recogniser.parameters()).dtype
-    mean = torch.zeros((), dtype=dtype, device=shape.device)
+    mean = torch.zeros((), dtype=dtype, device=settled.world.device)
     for yaw, share in zip(*yaws_of(camera_rotations, recogniser.params.yaws), strict=True):
-        volume = hold_last(_pictures(shape, weight, rotations, recogniser.params, float(yaw)), window)
+        volume = hold_last(pictures(settled, recogniser.params, float(yaw)), window)
         windows = recogniser.look(volume.to(dtype)).unfold(-1, window, stride).transpose(0, 1)
         mean = mean + share.to(dtype) * recogniser.name(windows).softmax(-1)
     return WindowScores(mean.argmax(-1), mean)
