@@ -10,11 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import torch
+import torch.nn.functional as F
 
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.features.patches import patch_grid, sample_image
 
-__all__ = ["Templates", "align_affine", "align_translation", "make_templates", "window_weights"]
+__all__ = ["Templates", "align_affine", "align_translation", "make_templates", "search_translation", "window_weights"]
 
 _TINY = 1e-6  # grey-value scale below which a patch counts as flat; 8-bit steps are 4e-3
 
@@ -101,6 +102,54 @@ def align_translation(
             current, _ = _standardise(sample_image(target[0], centre[:, None] + grid), weight)
             score = (weight * current * template).sum(-1) / weight.sum(-1).clamp_min(_TINY)
     return position, score
+
+
+def search_translation(
+    source: Float[Tensor, "height width"],
+    target: Float[Tensor, "rows columns"],
+    xy: Float[Tensor, "points 2"],
+    guess: Float[Tensor, "points 2"],
+    half: int,
+    reach: int,
+    weights: Float[Tensor, "points samples"] | None = None,
+) -> Float[Tensor, "points 2"]:
+    """Where in ``target`` the patches around ``xy`` of ``source`` fit best, by trying every whole-pixel shift.
+
+    Slower than :func:`align_translation`, but it needs no start inside the basin of attraction: for points whose
+    motion is not known yet and for those that were lost.
+
+    Args:
+        source, target: images, the same level of two pyramids.
+        xy: positions in ``source``, pixels.
+        guess: centres of the searches in ``target``.
+        half: half width of the window, pixels.
+        reach: largest shift from ``guess`` along each axis, pixels.
+        weights: which samples belong to the object, in [0, 1]; default all.
+
+    Example:
+        >>> import torch
+        >>> image = torch.rand(30, 40, generator=torch.Generator().manual_seed(0))
+        >>> here = torch.tensor([[20.0, 15.0]])
+        >>> search_translation(image, image, here, here + torch.tensor([3.0, -2.0]), 3, 4).tolist()
+        [[20.0, 15.0]]
+    """
+    window = window_weights(half, xy).expand(len(xy), -1)
+    weight = window if weights is None else window * weights
+    template, _ = _standardise(sample_image(source, xy[:, None] + patch_grid(half, xy)), weight)
+    side = 2 * (half + reach) + 1
+    wide = sample_image(target, guess[:, None] + patch_grid(half + reach, xy)).reshape(len(xy), 1, side, side)
+    # One correlation per point, as a grouped convolution: sums of w t v, w v and w v^2 over every window.
+    size = 2 * half + 1
+
+    def slide(image: Tensor, kernel: Tensor) -> Tensor:
+        kernels = kernel.reshape(len(xy), 1, size, size)
+        return F.conv2d(image.transpose(0, 1), kernels, groups=len(xy))[0].flatten(1)
+
+    total = weight.sum(-1, keepdim=True).clamp_min(_TINY)
+    mean = slide(wide, weight) / total
+    spread = (slide(wide.square(), weight) / total - mean.square()).clamp_min(_TINY**2).sqrt()
+    best = (slide(wide, weight * template) / total / spread).argmax(1)
+    return guess + patch_grid(reach, xy)[best]
 
 
 @dataclass(frozen=True, eq=False)

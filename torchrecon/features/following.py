@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from torchrecon._typing import Float, Tensor
-from torchrecon.features.align import Templates, align_affine, align_translation, make_templates
+from torchrecon.features.align import Templates, align_affine, align_translation, make_templates, search_translation
 from torchrecon.features.region import Region
 from torchrecon.statespace import abg_gains, abg_predict, abg_update
 
@@ -137,11 +137,25 @@ def _stretch(affine: Tensor) -> Tensor:
     return torch.maximum(larger, larger / determinant)
 
 
-def _local_motion(xy: Tensor, moved: Tensor, covariance: Tensor, trusted: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def _bend(affine: Tensor, scale: float) -> Tensor:
+    """Variance (n, 2, 2) of a match by the surface being bent: its deviation grows with the stretch of the window.
+
+    An affine map carries a window exactly only on a plane. On a limb the window's outer parts lie deeper than its
+    centre, and move against it by more the further the surface has turned since the template was taken. The error
+    is the same in every later match with this template, so no average over frames or neighbours lowers it.
+    """
+    return ((_stretch(affine) - 1.0) * scale).square()[:, None, None] * _identity(len(affine), affine)
+
+
+def _local_motion(
+    xy: Tensor, moved: Tensor, covariance: Tensor, trusted: Tensor, count: int, alike: float
+) -> tuple[Tensor, Tensor]:
     """Where each point would be if it moved as its neighbours do, and the variance (px^2) of that guess.
 
-    An affine motion is fitted to the displacements of the ``count`` nearest trusted others, the better localised
-    ones weighing more; the variance is the scatter of the neighbours about the fit.
+    An affine motion is fitted to the displacements of the ``count`` nearest trusted others; the variance is the
+    scatter of the neighbours about the fit. The better localised ones weigh more, and those that moved as the point
+    itself did, to within ``alike`` pixels: on a limb most neighbours may lie on the trunk behind it. Where nobody
+    moved like the point the weights are even again, and the fit says that it is alone.
     """
     total = int(trusted.sum())
     if total < 6:
@@ -152,34 +166,66 @@ def _local_motion(xy: Tensor, moved: Tensor, covariance: Tensor, trusted: Tensor
     weight = 1.0 / (covariance.diagonal(dim1=-2, dim2=-1).sum(-1)[index] + 0.02)
     weight = weight * torch.exp(-0.5 * (near / near.median(1, keepdim=True).values.clamp_min(1.0)) ** 2)
     weight = torch.where(torch.isfinite(near), weight, torch.zeros_like(weight))
+    step = moved - xy
+    apart = (step[index] - step[:, None]).square().sum(-1)
+    weight = weight / (1.0 + apart / alike**2) ** 2
     scale = near.median(1).values.clamp_min(1.0)[:, None, None]
     offset = (xy[index] - xy[:, None]) / scale
     design = torch.cat([torch.ones_like(offset[..., :1]), offset], -1)
-    step = (moved - xy)[index]
     normal = (design * weight[..., None]).mT @ design
     ridge = weight.sum(1)[:, None, None] * torch.diag(xy.new_tensor([1e-4, 0.1, 0.1]))
-    fit = torch.linalg.solve(normal + ridge, (design * weight[..., None]).mT @ step)
-    rest = (step - design @ fit).square().sum(-1) / 2
+    fit = torch.linalg.solve(normal + ridge, (design * weight[..., None]).mT @ step[index])
+    rest = (step[index] - design @ fit).square().sum(-1) / 2
     # Median, not mean: one stray neighbour must not widen the gate; ln 2 is the median of that chi^2.
     return xy + fit[:, 0], rest.median(1).values / math.log(2.0)
+
+
+def _there_and_back(
+    last: Region, now: Region, start: Tensor, guess: Tensor, levels: int, params: TrackerParams
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Match by translation on the finest ``levels``: position, correlation, and pixels by which the way back misses."""
+    half = params.window
+
+    def match(source: Region, target: Region, xy: Tensor, begin: Tensor) -> tuple[Tensor, Tensor]:
+        weights = source.weights(xy, half)
+        weights = None if weights is None else weights[:levels]
+        pyramids = source.pyramid[:levels], target.pyramid[:levels]
+        return align_translation(*pyramids, xy, begin, half, params.iterations, weights)
+
+    moved, score = match(last, now, start, guess)
+    back, _ = match(now, last, moved, moved + start - guess)
+    return moved, score, (back - start).norm(dim=-1)
 
 
 def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> Alive:
     """Carry living tracks from the last frame into this one; tracks that fail a check are left out.
 
-    Match: translation from the last frame (coarse to fine, from the prediction), then affine against the track's
-    own template, which does not drift. Where the template no longer fits but the last frame does, the template is
-    taken anew from the last frame and the error of the position there stays with the track (``anchor``).
+    Match: translation from the last frame (coarse to fine, from the prediction; by trying every shift where that
+    fails), then affine against the track's own template, which does not drift. Where the template no longer fits but
+    the last frame does, the template is taken anew from the last frame and the error of the position there stays
+    with the track (``anchor``).
     """
     half, percent = params.window, now.size / 100.0
     predicted = abg_predict(alive.state, 1.0)
     start, guess = alive.xy - last.origin, predicted[..., 0] - now.origin
-    moved, step_score = align_translation(
-        last.pyramid, now.pyramid, start, guess, half, params.iterations, last.weights(start, half)
-    )
-    back, _ = align_translation(
-        now.pyramid, last.pyramid, moved, moved + start - guess, half, params.iterations, now.weights(moved, half)
-    )
+    levels = len(now.pyramid)
+    moved, step_score, returned = _there_and_back(last, now, start, guess, levels, params)
+
+    # A new point has no motion yet, and the search of a fast one may have ended beside it: try every shift.
+    lost = (alive.age == 0) | (step_score <= params.min_correlation) | (returned >= params.max_backward)
+    if levels > 1 and lost.any():
+        level = levels - 2
+        scale, weights = 2.0**-level, last.weights(start[lost], half)
+        where = search_translation(
+            last.pyramid[level], now.pyramid[level], start[lost] * scale, guess[lost] * scale, half,
+            math.ceil(params.reach * percent * scale), None if weights is None else weights[level],
+        )  # fmt: skip
+        second = _there_and_back(last, now, start[lost], where / scale, levels - 1, params)
+        failed = (returned[lost] >= params.max_backward) | (second[1] > step_score[lost])
+        better = failed & (second[2] < params.max_backward)
+        at = lost.nonzero()[better, 0]
+        for first, other in zip((moved, step_score, returned), second, strict=True):
+            first[at] = other[better]
     image = now.pyramid[0]
     xy, affine, score, residual = align_affine(alive.templates, image, moved, alive.affine, half, params.iterations)
 
@@ -199,11 +245,11 @@ def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> A
         anchor[stale] = torch.nan_to_num(alive.covariance[stale])
     match = match_covariance(templates, residual, half, params.misfit)
     good = fits(xy, affine, score, params.min_correlation) & (step_score > params.min_correlation)
-    good &= ((back - start).norm(dim=-1) < params.max_backward) & torch.isfinite(xy).all(-1)
+    good &= (returned < params.max_backward) & torch.isfinite(xy).all(-1)
 
     # Along an edge or a stripe the window says little: there the neighbours' motion decides (Kalman update).
-    expected, spread = _local_motion(start, xy, match, good, 12)
-    prior = torch.nan_to_num(alive.covariance) - alive.anchor
+    expected, spread = _local_motion(start, xy, match, good, 12, params.alike * percent)
+    prior = torch.nan_to_num(alive.covariance) - alive.anchor - _bend(alive.affine, params.bend * half)
     prior[stale] = 0.0
     prior = prior + (spread + (params.local_std * percent) ** 2)[:, None, None] * _identity(len(xy), xy)
     innovation = torch.linalg.inv(match + prior)
@@ -213,7 +259,7 @@ def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> A
     good &= odd.norm(dim=-1) < params.max_neighbour * percent
     xy = xy + (gain @ odd[..., None])[..., 0]
     match = match - gain @ match
-    covariance = anchor + (match + match.mT) / 2
+    covariance = anchor + (match + match.mT) / 2 + _bend(affine, params.bend * half)
     good &= now.admits(xy) & (torch.linalg.eigvalsh(covariance)[:, -1] < (params.max_std * percent) ** 2)
 
     found = xy + now.origin

@@ -47,9 +47,13 @@ class TrackerParams:
         gate: standard deviations by which a point's step may differ from what its neighbours' steps suggest.
         max_neighbour: the same difference in percent of the object's size (square root of its area).
         local_std: percent of the object's size; how well a point moves with its neighbours at best.
+        alike: percent of the object's size; neighbours whose step differs by more than this from a point's own count
+            little in what they suggest, they may belong to another limb.
+        reach: percent of the object's size; search radius for points whose motion is not known or that were lost.
         max_std: percent of the object's size; a track whose position has become less certain than this along any
             direction ends.
         misfit: share of a window's contrast that no warp explains; lower limit of the noise in the covariance.
+        bend: deviation that the bent surface adds to the covariance, in half widths of the window per unit of stretch.
         shading_sigma: pixels; grey values are matched after their local mean over this range is taken out; 0 = not.
         depth_jump: metres; a step of depth near a point that counts as an edge (where depth is given).
         sift: detection parameters.
@@ -59,9 +63,9 @@ class TrackerParams:
     levels: int = 3
     iterations: int = 6
     alpha: float = 0.8
-    detect_every: int = 3
+    detect_every: int = 1
     max_tracks: int = 400
-    min_distance: float = 4.0
+    min_distance: float = 3.0
     min_length: int = 5
     mask_margin: float = 2.0
     min_correlation: float = 0.7
@@ -70,13 +74,16 @@ class TrackerParams:
     max_disagreement: float = 2.0
     max_backward: float = 0.7
     gate: float = 3.0
-    max_neighbour: float = 0.85
+    max_neighbour: float = 0.75
     local_std: float = 0.25
-    max_std: float = 1.1
+    alike: float = 1.0
+    reach: float = 8.0
+    max_std: float = 1.0
     misfit: float = 0.2
+    bend: float = 0.15
     shading_sigma: float = 5.0
     depth_jump: float = 0.08
-    sift: SiftParams = field(default_factory=lambda: SiftParams(contrast=0.006))
+    sift: SiftParams = field(default_factory=lambda: SiftParams(contrast=0.004))
 
     def __post_init__(self) -> None:
         for name in ("window", "levels", "iterations", "detect_every", "max_tracks", "min_length"):
@@ -91,7 +98,7 @@ def _detect(region: Region, alive: Alive | None, next_id: int, params: TrackerPa
     room = params.max_tracks - (0 if alive is None else len(alive.ids))
     if room <= 0 or min(region.gray.shape) < 32 or not region.births.any():
         return None
-    found = detect_sift(region.gray[None, None], region.births[None], params.sift)
+    found = detect_sift(region.gray[None, None], region.births[None], params.sift, describe=False)
     xy = found.xy[0][found.valid[0]] + region.origin  # strongest first
     if alive is not None and len(alive.ids) and len(xy):
         xy = xy[torch.cdist(xy, alive.xy).amin(1) >= params.min_distance]
