@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from torchrecon.errors import ReconError
 from torchrecon.features import TrackerParams, track_points
-from torchrecon.features.align import align_affine, align_translation, make_templates
+from torchrecon.features.align import align_affine, align_translation, make_templates, search_translation
 from torchrecon.features.following import match_covariance
 from torchrecon.features.patches import image_pyramid
 from torchrecon.features.region import cut_region
@@ -199,6 +199,41 @@ def test_alignment_recovers_translation_and_affine_deformation():
     assert float((refined - truth).norm(dim=-1).max()) < 0.05
     assert float((deform - a).abs().max()) < 0.05
     assert float(score.min()) > 0.99
+
+
+def test_exhaustive_search_finds_a_shift_that_gradient_steps_miss():
+    image = _texture(120, 140, seed=11)
+    shift = torch.tensor([13.0, -9.0])
+    other = _sample(image, torch.tensor([[1.0, 0.0, -13.0], [0.0, 1.0, 9.0]]), (120, 140))
+    xy = torch.tensor([[50.0, 60.0], [80.0, 70.0], [60.0, 50.0]])
+    found = search_translation(0.5 * image + 0.2, other, xy, xy, 5, 16)
+    assert torch.equal(found, xy + shift)
+    stepped, _ = align_translation([image], [other], xy, xy, 5)
+    assert float((stepped - xy - shift).norm(dim=-1).max()) > 2.0
+    # Samples that belong to something else do not decide: the right half of the window is covered.
+    covered = other.clone()
+    covered[:, 64:] = _texture(120, 140, seed=12)[:, 64:]
+    weights = (torch.arange(11) <= 5).double().repeat(11)[None]
+    assert torch.equal(search_translation(image, covered, xy[:1], xy[:1], 5, 16, weights), xy[:1] + shift)
+
+
+def test_a_thin_limb_before_a_still_trunk_keeps_its_points():
+    """Its nearest neighbours are half on the trunk: the points must be judged by those that move with them."""
+    trunk, limb = _texture(160, 240, seed=13), _texture(160, 240, seed=14)
+    frames, steps = [], 10
+    for index in range(steps):
+        frame = trunk.clone()
+        left = 40 + 6 * index
+        frame[:, left : left + 18] = limb[:, 100:118]
+        frames.append(frame[None])
+    tracks = track_points(frames)
+    middle = tracks.xy[..., 0] - 49 - 6.0 * torch.arange(steps)[:, None]
+    first = tracks.visible.int().argmax(0)
+    on_limb = middle[first, torch.arange(tracks.points)].abs() < 6
+    step = (tracks.xy[1:] - tracks.xy[:-1])[:, on_limb]
+    step = step[torch.isfinite(step).all(-1)]
+    assert len(step) > 30
+    assert float(((step - torch.tensor([6.0, 0.0])).norm(dim=-1) < 0.5).double().mean()) > 0.9
 
 
 def test_match_covariance_predicts_the_scatter_of_matches(generator):
