@@ -73,7 +73,8 @@ class Augmentation:
         tempo: largest relative change of speed.
         flat: odds that a variation has no depth to speak of and is shown as the distractor class ``flat``: what can
             be read without depth must not be what the recogniser reads. Not for the recogniser of 2D views.
-        flat_depth: largest share of its depth that a flat variation keeps.
+        flat_depth: largest share of its depth that a flat variation keeps: little, because what is seen of a body from
+            one side is shallow too.
     """
 
     points: tuple[int, int] = (150, 600)
@@ -88,8 +89,8 @@ class Augmentation:
     offset: float = 0.1
     depth_scale: float = 0.15
     tempo: float = 0.15
-    flat: float = 0.12
-    flat_depth: float = 0.25
+    flat: float = 0.1
+    flat_depth: float = 0.05
 
 
 AS_TRACKED = Augmentation(
