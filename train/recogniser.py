@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import platform
 import shutil
 import subprocess
@@ -151,6 +152,8 @@ class Training(L.LightningModule):
         width: channels of the first layer.
         learning_rate: peak of the one-cycle schedule.
         weight_decay: of AdamW.
+        flat_prior: how probable the class ``flat`` is a priori against each of the others once training is over. Real
+            tracks show less of a body than training films do, and so look a little flat: only clear evidence counts.
     """
 
     def __init__(
@@ -160,11 +163,19 @@ class Training(L.LightningModule):
         width: int = 16,
         learning_rate: float = 3e-3,
         weight_decay: float = 1e-2,
+        flat_prior: float = 0.1,
     ) -> None:
         super().__init__()
         extra = () if read_out.views == ("camera",) else (FLAT_CLASS,)
         self.recogniser = Recogniser((*classes, *extra), read_out, width)
-        self.learning_rate, self.weight_decay = learning_rate, weight_decay
+        self.learning_rate, self.weight_decay, self.flat_prior = learning_rate, weight_decay, flat_prior
+
+    @torch.no_grad()
+    def trained(self) -> Recogniser:
+        """The recogniser in evaluation mode, its classes equally probable in training, with ``flat_prior``."""
+        if FLAT_CLASS in self.recogniser.classes:
+            self.recogniser.to_classes.bias[self.recogniser.classes.index(FLAT_CLASS)] += math.log(self.flat_prior)
+        return self.recogniser.eval()
 
     def on_train_epoch_start(self) -> None:
         torch.manual_seed(self.current_epoch)  # dropout depends on the epoch, not on what was drawn before
@@ -256,7 +267,7 @@ def main(arguments: list[str] | None = None) -> int:
     command.trainer.callbacks = [*callbacks, ModelCheckpoint(half_way, save_last=True)]
     last = half_way / "last.ckpt"
     command.trainer.fit(command.model, command.datamodule, ckpt_path=last if last.exists() else None)
-    recogniser = command.model.recogniser.eval()
+    recogniser = command.model.trained()
 
     report: dict[str, Any] = {"settings": settings, "settings_hash": digest, **_origin()}
     data = command.datamodule
