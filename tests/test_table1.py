@@ -16,7 +16,6 @@ from eval.job import Cache, Profile, digest, plain, read_json, run_parallel, sou
 from eval.predict import load_row, row_path, tracks_path
 from eval.recognisers import Reader
 from eval.rows import FLAT, ROWS, TRUE_3D, VIEWS_2D, rows_of
-from eval.rows.rotations import TurnParams, turning_rigid
 from eval.rows.template import load_prior, place_template, save_prior, template_layout, train_prior
 from eval.scoring import PAPER, bootstrap_cells, draw, table_text
 from eval.sequences import (
@@ -35,6 +34,7 @@ from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Tracks
 from torchrecon.measurement.camera import project_points
 from torchrecon.models.recogniser import ReadOut, Recogniser, save_recogniser, weights_hash
+from torchrecon.nrsfm.turning import TurnParams, turning_rigid
 
 
 def test_cache_of_another_configuration_is_refused(tmp_path):

@@ -2,7 +2,7 @@
 
 A row takes the tracks of one sequence and a :class:`Context` and returns points in camera axes. Every monocular
 row of another's style works on :class:`Views`: image positions in the units of one shared rigid factorisation,
-which is also the one source of camera rotations for all of them (see ``rotations``), so that rows differ in their
+which is also the one source of camera rotations for all of them (see ``turning_rigid``), so that rows differ in their
 idea and not in their rotations. The sign of depth is that of the shared factorisation, decided there by perspective,
 for all rows alike.
 """
@@ -15,11 +15,11 @@ from typing import Any
 
 import torch
 
-from eval.rows.rotations import turning_rigid
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.measurement import FilledTracks, Reconstruction, Tracks
 from torchrecon.measurement.camera import normalised_coordinates
 from torchrecon.nrsfm import get_solver
+from torchrecon.nrsfm.turning import turning_rigid
 
 __all__ = [
     "Context",

@@ -1,25 +1,24 @@
 """Tracks that are born and die: a turning view and Gaussian-process trajectories, fitted by maximum likelihood.
 
-What is sought is the camera path alone; the points are integrated out (see ``likelihood``). A turn at constant
-angular velocity is looked for on a grid of axes and rates, with rest positions spread about the axis as the image
+What is sought is the camera path alone; the points are integrated out (see ``likelihood``). Candidates are the turns of
+a rigid body, found in the robust, smooth way of ``turning``: the trunk decides them. Rotations refined under the
+trajectory likelihood raise it and the error together (the points are independent there, so limbs that swing together
+are explained by a turn), so only the translation is. Rest positions are spread about the turning axis as the image
 shows them: an isotropic prior would charge every point for a depth extent that the body does not have, and so favour
-too slow a turn. The best candidates are refined with a smooth translation. Rotations that are free in every frame
-raise the likelihood and the error together (limbs are explained by wobble), so they are not offered. With the
-camera path found, the kernels are learned from the tracks; the points are then the posterior mean. With intrinsics
-the likelihood itself tells the two mirror images apart; without, the documented rule picks one. Assumption to keep in
-mind: the view turns steadily in the axes of the body.
+too slow a turn. Under each candidate the kernels are learned from the tracks, and the likeliest wins; the points are
+then the posterior mean. With intrinsics the likelihood itself tells the two mirror images apart; without, the
+documented rule picks one. Assumption to keep in mind: the view turns about one axis, at a rate that changes slowly.
 Derived here; not a published method.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
-from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, mirror_sign, solve_items, turn_of_view
 from torchrecon.nrsfm.likelihood import (
@@ -33,6 +32,7 @@ from torchrecon.nrsfm.likelihood import (
     posterior_points,
 )
 from torchrecon.nrsfm.observations import Observations, observe
+from torchrecon.nrsfm.turning import TurnParams, rigid_turns
 
 __all__ = ["FoundPath", "TrajectoryParams", "find_path", "place_points", "solve_trajectories", "thinning", "trajectory"]
 
@@ -48,16 +48,14 @@ class TrajectoryParams:
         floor: variance of the unpredictable part of the deviation (relative, as ``variances``).
         inflation: factor on the standard deviation of the observations: tracks drift more than their covariance says.
         default_noise: standard deviation where no covariance is given (rms sizes of the body in the image).
-        rates: angular velocities of the grid (degrees per second), tried in both senses where the sense matters.
         axes: directions of the turning axis in the image (degrees from the vertical).
+        turn: of the search for the turn of a rigid body.
+        narrow: field of view that stands for parallel rays (radians per rms size).
         entries: observations per point that the search uses at most; frames are thinned to reach it (count).
-        grid_points: longest tracks that are scored on the grid (count).
-        search_points: longest tracks that the refinement uses (count).
-        candidates: turns of the grid that are refined and learned (count).
-        iterations: descent steps per round, two rounds per candidate (count).
+        search_points: longest tracks that the search for the path uses (count).
+        iterations: descent steps of the translation (count).
         drift: standard deviation of the translation about the mean image position of the seen points (rms sizes).
         drift_memory: its time scale (seconds).
-        rate_spread: standard deviation of the angular velocity about the grid point (degrees per second).
         kernel_weight: weight of the Matern kernels against the learned ones (coordinates, three per point).
         kernel_iterations: rounds of learning the kernels (count).
         static_turn: change of view below which depth is called undetermined (degrees): a fixed camera on a moving
@@ -70,18 +68,16 @@ class TrajectoryParams:
     variances: tuple[float, ...] = (0.001, 0.01, 0.05, 0.3)
     memory: float = 0.2
     floor: float = 1e-5
-    inflation: float = 1.4
+    inflation: float = 3.0
     default_noise: float = 0.01
-    rates: tuple[float, ...] = (25.0, 50.0, 75.0, 100.0, 125.0, 150.0, 200.0)
     axes: tuple[float, ...] = (0.0, 45.0, 90.0, 135.0)
+    turn: TurnParams = field(default_factory=TurnParams)
+    narrow: float = 0.01
     entries: int = 16
-    grid_points: int = 100
-    search_points: int = 200
-    candidates: int = 4
+    search_points: int = 300
     iterations: int = 12
     drift: float = 0.3
     drift_memory: float = 0.4
-    rate_spread: float = 25.0
     kernel_weight: float = 100.0
     kernel_iterations: int = 5
     static_turn: float = 60.0
@@ -152,38 +148,54 @@ def _distances(data: Observations) -> Tensor:
     return torch.where(torch.isfinite(body), -torch.log(body * data.unit), start)
 
 
-def _start(data: Observations) -> tuple[Tensor, Tensor]:
-    """Translation and log scale that put the mean of the seen points at the origin of the body."""
+def _start(data: Observations) -> CameraPath:
+    """A view that does not turn, with the mean of the seen points at the origin of the body."""
     log_scale = _distances(data)
-    centres = _centres(data)
-    if data.tracks.intrinsics is None:
-        return centres, log_scale
-    distance = torch.exp(-log_scale) / data.unit
-    return (data.offset + data.unit * centres) * distance[:, None], log_scale
+    shift = _centres(data)
+    if data.tracks.intrinsics is not None:
+        shift = (data.offset + data.unit * shift) * (torch.exp(-log_scale) / data.unit)[:, None]
+    still = torch.eye(3, dtype=shift.dtype, device=shift.device).expand(len(shift), 3, 3)
+    return CameraPath(still, shift, log_scale)
 
 
-def _turning(times: Tensor, velocity: Tensor) -> Tensor:
-    """Rotations (F, 3, 3) at constant angular velocity (3,) in radians per second, identity in mid-sequence."""
-    return rotation_from_vector((times - times.mean())[:, None] * velocity)
+def _velocity(rotations: Tensor, times: Tensor) -> Tensor:
+    """Mean angular velocity (3,) of a path in camera axes, radians per second."""
+    step = rotations[1:] @ rotations[:-1].mT
+    twist = torch.stack([step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0], step[:, 1, 0] - step[:, 0, 1]])
+    return twist.sum(1) / (2 * (times[-1] - times[0]).clamp_min(1e-9))
+
+
+def _turns(data: Observations, points: Tensor, params: TrajectoryParams) -> list[CameraPath]:
+    """The best turns of a rigid body, identity in mid-sequence; with measured depth also a view that does not turn."""
+    start = _start(data)
+    perspective = data.tracks.intrinsics is not None
+    # Without intrinsics the rays are parallel: the same as a body far away, seen within a narrow angle.
+    narrow = 1.0 if perspective else params.narrow
+    plane = data.offset + data.unit * data.xy if perspective else narrow * data.xy
+    found = rigid_turns(
+        plane[:, points], data.visible[:, points], data.tracks.fps, params.axes, not perspective, params.turn
+    )
+    paths = [start] if data.tracks.depth is not None else []
+    middle = len(plane) // 2
+    for turn in found:
+        shift = turn.translation[:, :2] / turn.translation[:, 2:] / narrow
+        if perspective:
+            shift = shift * (torch.exp(-start.log_scale) / data.unit)[:, None]
+        paths.append(CameraPath(turn.rotations @ turn.rotations[middle].mT, shift, start.log_scale))
+    return paths
 
 
 def _refine(
-    packed: Packed,
-    data: Observations,
-    velocity: Tensor,
-    prior: MotionPrior,
-    noise: float,
-    params: TrajectoryParams,
-    turning: bool = True,
-) -> tuple[float, Tensor, CameraPath]:
-    """Angular velocity (unless the view is held) and smooth translation of highest posterior density."""
+    packed: Packed, data: Observations, start: CameraPath, prior: MotionPrior, noise: float, params: TrajectoryParams
+) -> tuple[float, CameraPath]:
+    """Minus the log posterior density, and the path whose smooth translation near that of ``start`` minimises it."""
     times = data.tracks.times
-    shift, log_scale = _start(data)
-    eye = torch.eye(len(times), dtype=times.dtype, device=times.device)
+    frames = len(times)
+    eye = torch.eye(frames, dtype=times.dtype, device=times.device)
     drift = torch.linalg.cholesky(
         params.drift**2 * matern32(times, params.drift_memory) + (0.1 * params.drift) ** 2 * eye
     )
-    unknown = torch.zeros(3 + 2 * len(times), dtype=times.dtype, device=times.device, requires_grad=True)
+    unknown = torch.zeros(frames, 2, dtype=times.dtype, device=times.device, requires_grad=True)
     optimiser = torch.optim.LBFGS(
         [unknown],
         max_iter=params.iterations,
@@ -192,42 +204,21 @@ def _refine(
         line_search_fn="strong_wolfe",
     )
 
-    def path() -> tuple[Tensor, CameraPath]:
-        speed = velocity + math.radians(params.rate_spread) * unknown[:3] * float(turning)
-        return speed, CameraPath(_turning(times, speed), shift + drift @ unknown[3:].view(len(times), 2), log_scale)
+    def density() -> tuple[Tensor, CameraPath]:
+        path = CameraPath(start.rotations, start.translation + drift @ unknown, start.log_scale)
+        return negative_log_likelihood(packed, path, prior, noise) + 0.5 * unknown.square().sum(), path
 
     def closure() -> Tensor:
         optimiser.zero_grad()
-        value = negative_log_likelihood(packed, path()[1], prior, noise) + 0.5 * unknown.square().sum()
+        value, _ = density()
         value.backward()
         return value
 
     with torch.enable_grad():
         optimiser.step(closure)
     with torch.no_grad():
-        speed, found = path()
-        value = negative_log_likelihood(packed, found, prior, noise) + 0.5 * unknown.square().sum()
-    return float(value), speed, found
-
-
-def _grid(data: Observations, params: TrajectoryParams) -> list[Tensor]:
-    """Angular velocities (3,) in radians per second; one sense only where the mirror image is as likely."""
-    senses = (1.0, -1.0) if data.tracks.intrinsics is not None else (1.0,)
-    grid = []
-    for degrees in params.axes:
-        angle = math.radians(degrees)
-        axis = data.xy.new_tensor([math.sin(angle), math.cos(angle), 0.0])
-        grid += [axis * (sense * math.radians(rate)) for rate in params.rates for sense in senses]
-    return grid
-
-
-def _distinct(velocities: list[Tensor], count: int) -> list[Tensor]:
-    """The first ones, best first, that are not neighbours on the grid."""
-    kept: list[Tensor] = []
-    for velocity in velocities:
-        if all(float((velocity - other).norm()) > 0.4 * float(velocity.norm()) for other in kept):
-            kept.append(velocity)
-    return kept[:count]
+        value, path = density()
+    return float(value), path
 
 
 def thinning(data: Observations, params: TrajectoryParams) -> int:
@@ -236,54 +227,39 @@ def thinning(data: Observations, params: TrajectoryParams) -> int:
 
 
 def find_path(data: Observations, params: TrajectoryParams) -> FoundPath:
-    """The likeliest of all steady turns and, where depth is not measured, of fixed views."""
+    """The likeliest of the turns of a rigid body and, where depth is not measured, of fixed views."""
     noise = params.inflation if data.noise_known else params.default_noise
-    thinned = pack(data, thinning(data, params))
-    order = torch.argsort(thinned.seen.sum(1), descending=True, stable=True)[: params.search_points]
-    search = thinned.select(order)
-    coarse = thinned.select(order[: params.grid_points])
-    shift, log_scale = _start(data)
-    scored = []
-    with torch.no_grad():
-        for velocity in _grid(data, params):
-            prior = _prior(data, velocity / velocity.norm(), params)
-            path = CameraPath(_turning(data.tracks.times, velocity), shift, log_scale)
-            scored.append((float(negative_log_likelihood(coarse, path, prior, noise)), velocity))
-    scored.sort(key=lambda entry: entry[0])
+    packed = pack(data, thinning(data, params))
+    order = torch.argsort(packed.seen.sum(1), descending=True, stable=True)[: params.search_points]
+    search = packed.select(order)
+    times = data.tracks.times
+    upright = data.xy.new_tensor([0.0, 1.0, 0.0])
     answers = []
-    for velocity in _distinct([velocity for _, velocity in scored], params.candidates):
-        speed = velocity
-        # The refined axis may have left that of the grid: a second round measures the body about its own axis.
-        for _ in range(2):
-            prior = _prior(data, speed / speed.norm().clamp_min(1e-9), params)
-            value, speed, path = _refine(search, data, speed, prior, noise, params)
-        answers.append(_learned(thinned, value, speed, path, prior, noise, params))
-    best = min(answers, key=lambda answer: answer[0])
+    for start in _turns(data, order, params):
+        velocity = _velocity(start.rotations, times)
+        speed = velocity.norm()
+        prior = _prior(data, velocity / speed if speed > 0 else upright, params)
+        value, path = _refine(search, data, start, prior, noise, params)
+        answers.append((*_learned(packed, path, prior, noise, params), value, path, velocity))
+    _, best_prior, value, path, velocity = min(answers, key=lambda answer: answer[0])
     evidence = math.inf
     if data.tracks.depth is None:
         still = []
-        for degrees in (0.0, 90.0):  # the body is longest along or across the image
-            axis = data.xy.new_tensor([math.sin(math.radians(degrees)), math.cos(math.radians(degrees)), 0.0])
+        for axis in (upright, data.xy.new_tensor([1.0, 0.0, 0.0])):  # the body is longest along or across the image
             prior = _prior(data, axis, params)
-            still.append((*_refine(search, data, torch.zeros_like(axis), prior, noise, params, turning=False), prior))
-        value, speed, path, prior = min(still, key=lambda answer: answer[0])
-        evidence = (value - best[1]) / int(search.seen.sum())
+            still.append((*_refine(search, data, _start(data), prior, noise, params), prior))
+        fixed, fixed_path, prior = min(still, key=lambda answer: answer[0])
+        evidence = (fixed - value) / int(search.seen.sum())
         if evidence < 0:
-            best = _learned(thinned, value, speed, path, prior, noise, params)
-    _, _, speed, path, prior = best
-    return FoundPath(path, prior, noise, speed, evidence)
+            path, velocity = fixed_path, torch.zeros_like(velocity)
+            _, best_prior = _learned(packed, path, prior, noise, params)
+    return FoundPath(path, best_prior, noise, velocity, evidence)
 
 
 def _learned(
-    packed: Packed,
-    value: float,
-    speed: Tensor,
-    path: CameraPath,
-    prior: MotionPrior,
-    noise: float,
-    params: TrajectoryParams,
-) -> tuple[float, float, Tensor, CameraPath, MotionPrior]:
-    """The answer with kernels learned under its path, led by minus the log-likelihood of all points under them.
+    packed: Packed, path: CameraPath, prior: MotionPrior, noise: float, params: TrajectoryParams
+) -> tuple[float, MotionPrior]:
+    """Kernels learned under a path, led by minus the log-likelihood of all points under them.
 
     Kernels as given rank the mirror image or half the rate first where the motion of the body is unlike them.
     """
@@ -291,7 +267,7 @@ def _learned(
         prior = learn_kernels(
             packed, path, prior, noise, weight=params.kernel_weight, iterations=params.kernel_iterations
         )
-        return float(negative_log_likelihood(packed, path, prior, noise)), value, speed, path, prior
+        return float(negative_log_likelihood(packed, path, prior, noise)), prior
 
 
 def place_points(
