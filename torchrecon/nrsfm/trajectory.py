@@ -32,7 +32,7 @@ from torchrecon.nrsfm.likelihood import (
     posterior_points,
 )
 from torchrecon.nrsfm.observations import Observations, observe
-from torchrecon.nrsfm.turning import TurnParams, rigid_turns
+from torchrecon.nrsfm.turning import RigidTurn, TurnParams, rigid_turns, rigid_under
 
 __all__ = ["FoundPath", "TrajectoryParams", "find_path", "place_points", "solve_trajectories", "thinning", "trajectory"]
 
@@ -68,7 +68,7 @@ class TrajectoryParams:
     variances: tuple[float, ...] = (0.001, 0.01, 0.05, 0.3)
     memory: float = 0.2
     floor: float = 1e-5
-    inflation: float = 3.0
+    inflation: float = 2.0
     default_noise: float = 0.01
     axes: tuple[float, ...] = (0.0, 45.0, 90.0, 135.0)
     turn: TurnParams = field(default_factory=TurnParams)
@@ -148,14 +148,29 @@ def _distances(data: Observations) -> Tensor:
     return torch.where(torch.isfinite(body), -torch.log(body * data.unit), start)
 
 
-def _start(data: Observations) -> CameraPath:
-    """A view that does not turn, with the mean of the seen points at the origin of the body."""
+def _starts(
+    data: Observations, points: Tensor, params: TrajectoryParams
+) -> tuple[CameraPath, list[tuple[CameraPath, float]]]:
+    """A rigid body before a view that does not turn, and under the best turns with their mean squared residuals.
+
+    Paths are the identity in mid-sequence.
+    """
     log_scale = _distances(data)
-    shift = _centres(data)
-    if data.tracks.intrinsics is not None:
-        shift = (data.offset + data.unit * shift) * (torch.exp(-log_scale) / data.unit)[:, None]
-    still = torch.eye(3, dtype=shift.dtype, device=shift.device).expand(len(shift), 3, 3)
-    return CameraPath(still, shift, log_scale)
+    perspective = data.tracks.intrinsics is not None
+    # Without intrinsics the rays are parallel: the same as a body far away, seen within a narrow angle.
+    plane = (data.offset + data.unit * data.xy if perspective else params.narrow * data.xy)[:, points]
+    visible = data.visible[:, points]
+    away = torch.exp(-log_scale) / data.unit if perspective else torch.full_like(log_scale, 1 / params.narrow)
+    middle = len(plane) // 2
+
+    def path(turn: RigidTurn) -> CameraPath:
+        shift = turn.translation[:, :2] / turn.translation[:, 2:] * away[:, None]
+        return CameraPath(turn.rotations @ turn.rotations[middle].mT, shift, log_scale)
+
+    eye = torch.eye(3, dtype=plane.dtype, device=plane.device).expand(len(plane), 3, 3)
+    still = path(rigid_under(plane, visible, eye, params.turn))
+    found = rigid_turns(plane, visible, data.tracks.fps, params.axes, not perspective, params.turn)
+    return still, [(path(turn), turn.cost) for turn in found]
 
 
 def _velocity(rotations: Tensor, times: Tensor) -> Tensor:
@@ -165,30 +180,10 @@ def _velocity(rotations: Tensor, times: Tensor) -> Tensor:
     return twist.sum(1) / (2 * (times[-1] - times[0]).clamp_min(1e-9))
 
 
-def _turns(data: Observations, points: Tensor, params: TrajectoryParams) -> list[CameraPath]:
-    """The best turns of a rigid body, identity in mid-sequence; with measured depth also a view that does not turn."""
-    start = _start(data)
-    perspective = data.tracks.intrinsics is not None
-    # Without intrinsics the rays are parallel: the same as a body far away, seen within a narrow angle.
-    narrow = 1.0 if perspective else params.narrow
-    plane = data.offset + data.unit * data.xy if perspective else narrow * data.xy
-    found = rigid_turns(
-        plane[:, points], data.visible[:, points], data.tracks.fps, params.axes, not perspective, params.turn
-    )
-    paths = [start] if data.tracks.depth is not None else []
-    middle = len(plane) // 2
-    for turn in found:
-        shift = turn.translation[:, :2] / turn.translation[:, 2:] / narrow
-        if perspective:
-            shift = shift * (torch.exp(-start.log_scale) / data.unit)[:, None]
-        paths.append(CameraPath(turn.rotations @ turn.rotations[middle].mT, shift, start.log_scale))
-    return paths
-
-
 def _refine(
     packed: Packed, data: Observations, start: CameraPath, prior: MotionPrior, noise: float, params: TrajectoryParams
-) -> tuple[float, CameraPath]:
-    """Minus the log posterior density, and the path whose smooth translation near that of ``start`` minimises it."""
+) -> CameraPath:
+    """The path whose smooth translation near that of ``start`` has the highest posterior density."""
     times = data.tracks.times
     frames = len(times)
     eye = torch.eye(frames, dtype=times.dtype, device=times.device)
@@ -204,21 +199,19 @@ def _refine(
         line_search_fn="strong_wolfe",
     )
 
-    def density() -> tuple[Tensor, CameraPath]:
-        path = CameraPath(start.rotations, start.translation + drift @ unknown, start.log_scale)
-        return negative_log_likelihood(packed, path, prior, noise) + 0.5 * unknown.square().sum(), path
+    def path() -> CameraPath:
+        return CameraPath(start.rotations, start.translation + drift @ unknown, start.log_scale)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
-        value, _ = density()
+        value = negative_log_likelihood(packed, path(), prior, noise) + 0.5 * unknown.square().sum()
         value.backward()
         return value
 
     with torch.enable_grad():
         optimiser.step(closure)
     with torch.no_grad():
-        value, path = density()
-    return float(value), path
+        return path()
 
 
 def thinning(data: Observations, params: TrajectoryParams) -> int:
@@ -227,39 +220,47 @@ def thinning(data: Observations, params: TrajectoryParams) -> int:
 
 
 def find_path(data: Observations, params: TrajectoryParams) -> FoundPath:
-    """The likeliest of the turns of a rigid body and, where depth is not measured, of fixed views."""
+    """The likeliest of the turns of a rigid body and, where depth is not measured, of fixed views.
+
+    The rigid fit has its say beside the likelihood of the trajectories: it reads perspective off the trunk.
+    """
     noise = params.inflation if data.noise_known else params.default_noise
     packed = pack(data, thinning(data, params))
+    seen = int(packed.seen.sum())
     order = torch.argsort(packed.seen.sum(1), descending=True, stable=True)[: params.search_points]
     search = packed.select(order)
-    times = data.tracks.times
     upright = data.xy.new_tensor([0.0, 1.0, 0.0])
-    answers = []
-    for start in _turns(data, order, params):
-        velocity = _velocity(start.rotations, times)
-        speed = velocity.norm()
-        prior = _prior(data, velocity / speed if speed > 0 else upright, params)
-        value, path = _refine(search, data, start, prior, noise, params)
-        answers.append((*_learned(packed, path, prior, noise, params), value, path, velocity))
-    _, best_prior, value, path, velocity = min(answers, key=lambda answer: answer[0])
+
+    def judged(start: CameraPath, axis: Tensor) -> tuple[float, CameraPath, MotionPrior]:
+        path = _refine(search, data, start, _prior(data, axis, params), noise, params)
+        return _learned(packed, path, _prior(data, axis, params), noise, params)
+
+    still, found = _starts(data, order, params)
+    measured = data.tracks.depth is not None
+    if measured:  # depth says by itself what turns; the rigid fit, which does not read it, has no say
+        found = [(start, 1.0) for start, _ in [(still, 1.0), *found]]
+    turns = []
+    for start, cost in found:
+        velocity = _velocity(start.rotations, data.tracks.times)
+        value, path, prior = judged(start, velocity / velocity.norm() if velocity.any() else upright)
+        turns.append((value + seen * math.log(cost) / params.turn.together, value, path, prior, velocity))
+    _, value, path, prior, velocity = min(turns, key=lambda turn: turn[0])
     evidence = math.inf
-    if data.tracks.depth is None:
-        still = []
-        for axis in (upright, data.xy.new_tensor([1.0, 0.0, 0.0])):  # the body is longest along or across the image
-            prior = _prior(data, axis, params)
-            still.append((*_refine(search, data, _start(data), prior, noise, params), prior))
-        fixed, fixed_path, prior = min(still, key=lambda answer: answer[0])
-        evidence = (fixed - value) / int(search.seen.sum())
+    if not measured:
+        # A body is longest along or across the image.
+        views = [judged(still, axis) for axis in (upright, data.xy.new_tensor([1.0, 0.0, 0.0]))]
+        fixed = min(views, key=lambda answer: answer[0])
+        evidence = (fixed[0] - value) / seen
         if evidence < 0:
-            path, velocity = fixed_path, torch.zeros_like(velocity)
-            _, best_prior = _learned(packed, path, prior, noise, params)
-    return FoundPath(path, best_prior, noise, velocity, evidence)
+            _, path, prior = fixed
+            velocity = torch.zeros_like(velocity)
+    return FoundPath(path, prior, noise, velocity, evidence)
 
 
 def _learned(
     packed: Packed, path: CameraPath, prior: MotionPrior, noise: float, params: TrajectoryParams
-) -> tuple[float, MotionPrior]:
-    """Kernels learned under a path, led by minus the log-likelihood of all points under them.
+) -> tuple[float, CameraPath, MotionPrior]:
+    """A path with kernels learned under it, led by minus the log-likelihood of all points.
 
     Kernels as given rank the mirror image or half the rate first where the motion of the body is unlike them.
     """
@@ -267,7 +268,7 @@ def _learned(
         prior = learn_kernels(
             packed, path, prior, noise, weight=params.kernel_weight, iterations=params.kernel_iterations
         )
-        return float(negative_log_likelihood(packed, path, prior, noise)), prior
+        return float(negative_log_likelihood(packed, path, prior, noise)), path, prior
 
 
 def place_points(

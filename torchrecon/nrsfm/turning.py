@@ -21,7 +21,7 @@ from torchrecon.linalg import rotation_from_vector, skew
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.measurement.camera import normalised_coordinates
 
-__all__ = ["RigidTurn", "TurnParams", "rigid_turns", "turning_rigid"]
+__all__ = ["RigidTurn", "TurnParams", "rigid_turns", "rigid_under", "turning_rigid"]
 
 
 @dataclass(frozen=True)
@@ -152,6 +152,43 @@ def _steps(rotations: Float[Tensor, "frames 3 3"]) -> Float[Tensor, "steps 3"]:
     )
 
 
+def _outlier(plane: Tensor, visible: Tensor, params: TurnParams) -> float:
+    """The residual at which an observation counts half, tangents of the viewing angle."""
+    weight = visible.to(plane.dtype)[..., None]
+    seen = torch.where(visible[..., None], plane, torch.zeros_like(plane))
+    middle = seen.sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
+    return params.outlier * float((((seen - middle) * weight).square().sum() / (2 * weight.sum())).sqrt())
+
+
+def rigid_under(
+    plane: Float[Tensor, "frames points 2"],
+    visible: Bool[Tensor, "frames points"],
+    rotations: Float[Tensor, "frames 3 3"],
+    params: TurnParams | None = None,
+) -> RigidTurn:
+    """Rigid shape and translations that fit best under given rotations.
+
+    Args:
+        plane, visible, params: as for :func:`rigid_turns`.
+        rotations: canonical -> camera.
+
+    Example:
+        >>> import torch
+        >>> plane = 0.1 * torch.rand(8, 6, 2, generator=torch.Generator().manual_seed(0))
+        >>> rigid_under(plane, torch.ones(8, 6, dtype=torch.bool), torch.eye(3).expand(8, 3, 3)).shape.shape
+        torch.Size([6, 3])
+    """
+    p = params or TurnParams()
+    weight = visible.to(plane.dtype)
+    plane = torch.where(visible[..., None], plane, torch.zeros_like(plane))
+    middle = plane.sum(1) / weight.sum(1, keepdim=True).clamp_min(1)
+    translation = torch.cat([middle, torch.ones_like(middle[:, :1])], -1)
+    turn = RigidTurn(plane, weight, rotations, plane.new_zeros(plane.shape[1], 3), translation)
+    for _ in range(p.rounds):
+        turn = _fit_translation(_fit_shape(turn, p.ridge))
+    return _robust(turn, _outlier(plane, visible, p))
+
+
 def rigid_turns(
     plane: Float[Tensor, "frames points 2"],
     visible: Bool[Tensor, "frames points"],
@@ -183,13 +220,6 @@ def rigid_turns(
         0.07
     """
     p = params or TurnParams()
-    plane = torch.where(visible[..., None], plane, torch.zeros_like(plane))
-    weight = visible.to(plane.dtype)
-    count = weight.sum(1, keepdim=True).clamp_min(1)
-    middle = plane.sum(1) / count
-    size = ((plane - middle[:, None]).square().sum(-1) * weight).sum().div(2 * weight.sum()).sqrt()
-    outlier = p.outlier * float(size)
-    translation = torch.cat([middle, torch.ones_like(middle[:, :1])], -1)
     seconds = (torch.arange(len(plane), dtype=plane.dtype, device=plane.device) - len(plane) // 2) / fps
     found = []
     for sense in (1.0,) if parallel else (1.0, -1.0):
@@ -199,11 +229,9 @@ def rigid_turns(
             axis = plane.new_tensor([math.sin(angle), math.cos(angle), 0.0])
             for rate in p.rates:
                 rotations = rotation_from_vector(seconds[:, None] * (sense * math.radians(rate)) * axis)
-                turn = RigidTurn(plane, weight, rotations, plane.new_zeros(plane.shape[1], 3), translation)
-                for _ in range(p.rounds):
-                    turn = _fit_translation(_fit_shape(turn, p.ridge))
-                tried.append(_robust(turn, outlier))
+                tried.append(rigid_under(plane, visible, rotations, p))
         found += sorted(tried, key=lambda turn: turn.cost)[: p.kept]
+    outlier = _outlier(plane, visible, p)
     strength = (fps**2 / math.radians(p.acceleration)) ** 2
     refined = []
     for turn in found:
