@@ -34,6 +34,7 @@ class TurnParams:
         kept: best rates of each sense that are refined (count).
         refinements: alternations with the rotations free (count).
         acceleration: standard deviation of the angular acceleration (degrees per second^2).
+        tilt: standard deviation of the angular velocity across the axis that is tried (degrees per second).
         together: observations of one track err together while a limb moves; so many count as one.
         outlier: residual at which an observation counts half (rms sizes of the body in the image).
         ridge: pull of the shape to its centre where a point is hardly seen (observations).
@@ -44,6 +45,7 @@ class TurnParams:
     kept: int = 2
     refinements: int = 25
     acceleration: float = 6.0
+    tilt: float = 10.0
     together: float = 10.0
     outlier: float = 0.16
     ridge: float = 1e-2
@@ -114,15 +116,15 @@ def _robust(s: RigidTurn, outlier: float) -> RigidTurn:
     return replace(s, weight=torch.where(seen, share.square(), zero), cost=float(cost))
 
 
-def _fit_rotations(s: RigidTurn, strength: float, together: float) -> RigidTurn:
-    """One Gauss-Newton step of all rotations and translations under the prior on the angular acceleration."""
+def _fit_rotations(s: RigidTurn, axis: Tensor, fps: float, params: TurnParams) -> RigidTurn:
+    """One Gauss-Newton step of all rotations and translations under the priors on angular acceleration and axis."""
     frames = len(s.rotations)
     points = s.shape @ s.rotations.mT
     away = (points + s.translation[:, None])[..., 2:, None].clamp_min(1e-3)
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     # A small turn d moves a point by d x X = -[X]_x d.
     design = torch.cat([s.rows(-skew(points)), s.rows(eye.expand(*points.shape[:2], 3, 3))], -1) / away
-    weight = s.weight / (max(s.cost, 1e-12) * together)
+    weight = s.weight / (max(s.cost, 1e-12) * params.together)
     gram = torch.einsum("fp,fpai,fpaj->fij", weight, design, design)
     ridge = torch.eye(6, dtype=points.dtype, device=points.device)
     gram = gram + (1e-6 * gram.diagonal(dim1=-2, dim2=-1).amax()) * ridge
@@ -134,11 +136,16 @@ def _fit_rotations(s: RigidTurn, strength: float, together: float) -> RigidTurn:
     second = points.new_zeros(frames - 2, frames)
     index = torch.arange(frames - 2, device=points.device)
     second[index, index], second[index, index + 1], second[index, index + 2] = 1.0, -2.0, 1.0
+    first = second.new_zeros(frames - 1, frames)
+    index = torch.arange(frames - 1, device=points.device)
+    first[index, index], first[index, index + 1] = -1.0, 1.0
     step = _steps(s.rotations)
-    smooth = strength * torch.einsum("af,ag->fg", second, second)
+    steady = (fps**2 / math.radians(params.acceleration)) ** 2
+    upright = (fps / math.radians(params.tilt)) ** 2 * (eye - axis[:, None] * axis)
     system = torch.block_diag(*reduced).reshape(frames, 3, frames, 3)
-    system = system + torch.einsum("fg,ij->figj", smooth, eye)
-    goal = value - strength * second.T @ (step[1:] - step[:-1])
+    system = system + torch.einsum("fg,ij->figj", steady * second.T @ second, eye)
+    system = system + torch.einsum("fg,ij->figj", first.T @ first, upright)
+    goal = value - steady * second.T @ (step[1:] - step[:-1]) - first.T @ step @ upright
     turn = torch.linalg.solve(system.reshape(3 * frames, 3 * frames), goal.reshape(-1)).reshape(frames, 3)
     turn = turn * (0.2 / turn.norm(dim=-1).max().clamp_min(0.2))  # radians; a longer step leaves the linear range
     return replace(s, rotations=rotation_from_vector(turn) @ s.rotations)
@@ -229,15 +236,14 @@ def rigid_turns(
             axis = plane.new_tensor([math.sin(angle), math.cos(angle), 0.0])
             for rate in p.rates:
                 rotations = rotation_from_vector(seconds[:, None] * (sense * math.radians(rate)) * axis)
-                tried.append(rigid_under(plane, visible, rotations, p))
-        found += sorted(tried, key=lambda turn: turn.cost)[: p.kept]
+                tried.append((rigid_under(plane, visible, rotations, p), axis))
+        found += sorted(tried, key=lambda turn: turn[0].cost)[: p.kept]
     outlier = _outlier(plane, visible, p)
-    strength = (fps**2 / math.radians(p.acceleration)) ** 2
     refined = []
-    for turn in found:
+    for turn, axis in found:
         for _ in range(p.refinements):
             turn = _robust(turn, outlier)
-            turn = _fit_rotations(_fit_translation(_fit_shape(turn, p.ridge)), strength, p.together)
+            turn = _fit_rotations(_fit_translation(_fit_shape(turn, p.ridge)), axis, fps, p)
         refined.append(_robust(_fit_translation(_fit_shape(turn, p.ridge)), outlier))
     return sorted(refined, key=lambda turn: turn.cost)
 
