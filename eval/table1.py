@@ -140,7 +140,8 @@ def _remarks(rows: tuple[Row, ...], table: list[dict[str, Any]], notes: dict[str
     valid = true <= 3 and floor >= 25
     remarks = [
         f"Protocol: true 3D {true:.1f} % (must be at most 3), flat {floor:.1f} % (must be at least 25): "
-        + ("valid" if valid else "NOT VALID: this recogniser cannot tell methods apart")
+        + ("valid" if valid else "NOT VALID: this recogniser cannot tell methods apart"),
+        "The recogniser has a class for shapes without depth: flat points are wrong also because it names them so.",
     ]
     for row in rows:
         refused = [name for name, note in notes[row.key].items() if note.startswith("no answer")]
