@@ -185,7 +185,7 @@ def test_measured_depth_gives_metres():
     tracks = replace(tracks, depth=depth, depth_variance=torch.full_like(depth, 0.0004))
     rec = get_solver("auto")(tracks, 2)
     assert error3d_camera(rec.points3d, placed, tracks.visible) < 0.05
-    torch.testing.assert_close(rec.translation[:, 2], placed.mean(1)[:, 2], atol=0.1, rtol=0)
+    torch.testing.assert_close(rec.translation[:, 2], placed.mean(1)[:, 2], atol=0.05, rtol=0)
 
 
 def test_covariance3d_is_larger_where_nothing_was_seen():

@@ -14,7 +14,7 @@ Derived here; not a published method.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -323,6 +323,19 @@ def place_points(
     )
 
 
+def _at_distance(data: Observations, depth: Tensor, path: CameraPath, canonical: Tensor) -> CameraPath:
+    """The pinhole path with the distance of each frame moved by what measured depth still lies beyond the points.
+
+    The search starts from the median depth of the seen points, which is not that of the body's origin.
+    """
+    there = data.visible & torch.isfinite(depth)
+    distance = torch.exp(-path.log_scale) / data.unit
+    rest = depth / data.length - (canonical @ path.rotations.mT)[..., 2] - distance[:, None]
+    moved = torch.where(there, rest, torch.zeros_like(rest)).sum(1) / there.sum(1).clamp_min(1)
+    factor = (distance + moved) / distance
+    return CameraPath(path.rotations, path.translation * factor[:, None], path.log_scale - torch.log(factor))
+
+
 def solve_trajectories(
     item: Tracks, rank: int, generator: torch.Generator, params: TrajectoryParams | None = None
 ) -> Reconstruction:
@@ -331,7 +344,11 @@ def solve_trajectories(
     data = observe(item)
     found = find_path(data, params)
     with torch.no_grad():
-        canonical, spread, _ = posterior_points(pack(data), found.path, found.prior, found.noise)
+        packed = pack(data)
+        canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
+        if item.depth is not None and item.intrinsics is not None:
+            found = replace(found, path=_at_distance(data, item.depth, found.path, canonical))
+            canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
     return place_points(data, found, canonical, spread, rank, params)
 
 
