@@ -7,7 +7,8 @@ are explained by a turn), so only the translation is. Rest positions are spread 
 shows them: an isotropic prior would charge every point for a depth extent that the body does not have, and so favour
 too slow a turn. Under each candidate the kernels are learned from the tracks, and the likeliest wins; the points are
 then the posterior mean. With intrinsics the likelihood and the rigid fit together tell the two mirror images apart;
-without, the documented rule picks one. Assumption to keep in mind: the view turns about one axis, at a rate that changes slowly.
+without, the documented rule picks one. Assumption to keep in mind: the view turns about one axis, at a rate that
+changes slowly.
 Derived here; not a published method.
 """
 
