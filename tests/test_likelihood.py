@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Tracks
+from torchrecon.nrsfm import likelihood
 from torchrecon.nrsfm.likelihood import (
     CameraPath,
     MotionPrior,
@@ -89,6 +91,22 @@ def test_thinned_tracks_use_every_nth_frame_only():
     packed = pack(data, 3)
     assert bool((packed.frame[packed.seen] % 3 == 0).all())
     assert int(packed.seen.sum()) == int(data.visible[::3].sum())
+
+
+def test_batches_hold_every_entry_of_every_point_once(monkeypatch):
+    data, path, prior = _problem(perspective=False)
+    visible = data.visible.clone()
+    visible[3:, ::2] = False  # short and long tracks
+    packed = pack(replace(data, visible=visible))
+    assert sorted(torch.cat([points for points, _ in packed.batches]).tolist()) == list(range(visible.shape[1]))
+    assert sum(int(batch.seen.sum()) for _, batch in packed.batches) == int(visible.sum())
+    assert len({batch.seen.shape[1] for _, batch in packed.batches}) > 1
+    one = posterior_points(packed, path, prior, 0.2)
+    monkeypatch.setattr(likelihood, "_BATCH", 1)
+    single = pack(replace(data, visible=visible))
+    assert len(single.batches) == visible.shape[1]
+    for a, b in zip(one, posterior_points(single, path, prior, 0.2), strict=True):
+        torch.testing.assert_close(a, b)
 
 
 def test_learning_kernels_never_lowers_the_likelihood():

@@ -178,7 +178,7 @@ def test_shared_rotations_find_turn_and_mirror_of_short_tracks(generator, rate):
     xy = project_points(truth + torch.tensor([0.0, 0.0, 7.0]), k)
     xy = xy + 0.5 * torch.randn(xy.shape, generator=generator)
     tracks = Tracks(torch.where(visible[..., None], xy, torch.tensor(float("nan"))), intrinsics=k)
-    answer = turning_rigid(tracks, TurnParams(refinements=15))
+    answer = turning_rigid(tracks, TurnParams(refinements=15, search_points=200))
     step = rotations[1:] @ rotations[:-1].mT
     found = answer.rotations[1:] @ answer.rotations[:-1].mT
     assert float(torch.rad2deg((step - found).norm(dim=(-1, -2)) / 2**0.5).mean()) < 0.7

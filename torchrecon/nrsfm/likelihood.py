@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -28,6 +29,9 @@ __all__ = [
     "pack",
     "posterior_points",
 ]
+
+
+_BATCH = 60_000  # pairs of observations in a batch; a pair takes 4 to 9 numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +56,40 @@ class Packed:
     offset: Float[Tensor, " 2"]
     perspective: bool
 
-    def select(self, points: Int[Tensor, " m"]) -> Packed:
-        """The same for some of the points."""
+    def select(self, points: Int[Tensor, " m"], longest: int | None = None) -> Packed:
+        """The same for some of the points, cut to their ``longest`` track."""
         return Packed(
-            self.frame[points],
-            self.seen[points],
-            self.xy[points],
-            self.weight[points],
-            None if self.depth is None else self.depth[points],
-            None if self.depth_weight is None else self.depth_weight[points],
+            self.frame[points, :longest],
+            self.seen[points, :longest],
+            self.xy[points, :longest],
+            self.weight[points, :longest],
+            None if self.depth is None else self.depth[points, :longest],
+            None if self.depth_weight is None else self.depth_weight[points, :longest],
             self.unit,
             self.offset,
             self.perspective,
         )
+
+    @cached_property
+    def batches(self) -> list[tuple[Int[Tensor, " m"], Packed]]:
+        """Points of like length together, with their indices: most tracks are far shorter than the longest, and the
+        cost of one grows with the cube of its length. No batch is larger than what a processor holds close by."""
+        count = self.seen.sum(1)
+        order = torch.argsort(count, stable=True)
+        lengths = count[order].tolist()
+        parts, first = [], 0
+        while first < len(lengths):
+            last = first + 1
+            while (
+                last < len(lengths)
+                and lengths[last] <= max(4, 1.25 * lengths[first])
+                and (last + 1 - first) * lengths[last] ** 2 <= _BATCH
+            ):
+                last += 1
+            points = order[first:last]
+            parts.append((points, self.select(points, max(1, lengths[last - 1]))))
+            first = last
+        return parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +218,12 @@ def negative_log_likelihood(packed: Packed, path: CameraPath, prior: MotionPrior
     Args:
         noise: standard deviation of the whitened observations.
     """
-    rows, target, frame, real = _rows(packed, path, noise)
-    value: Tensor = _Likelihood.apply(rows, target, frame, prior)
-    return value + real.sum() * math.log(noise)
+    total = path.rotations.new_zeros(())
+    for _, batch in packed.batches:
+        rows, target, frame, real = _rows(batch, path, noise)
+        value: Tensor = _Likelihood.apply(rows, target, frame, prior)
+        total = total + value + real.sum() * math.log(noise)
+    return total
 
 
 def posterior_points(
@@ -206,6 +234,14 @@ def posterior_points(
     Entries that were not seen are predicted from the same point's other entries and are as uncertain as that is.
     The covariance is that of the likeliest class; the noise and the camera are taken as known.
     """
+    answers = [_posterior(batch, path, prior, noise) for _, batch in packed.batches]
+    back = torch.argsort(torch.cat([points for points, _ in packed.batches]))
+    mean, covariance = (torch.cat([answer[i] for answer in answers])[back].transpose(0, 1) for i in (0, 1))
+    return mean, covariance, torch.cat([answer[2] for answer in answers], 1)[:, back]
+
+
+def _posterior(packed: Packed, path: CameraPath, prior: MotionPrior, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean (points, frames, 3), covariance (points, frames, 3, 3) and shares (classes, points) of one batch."""
     rows, target, frame, _ = _rows(packed, path, noise)
     points, size, _ = rows.shape
     frames = prior.kernels.shape[-1]
@@ -228,7 +264,7 @@ def posterior_points(
     eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
     before = prior.rest + kernels.diagonal(dim1=1, dim2=2)[..., None, None] * eye
     covariance = before - torch.einsum("pmfi,pmfj->pfij", white, white)
-    return mean.transpose(0, 1), covariance.transpose(0, 1), share
+    return mean, covariance, share
 
 
 def learn_kernels(
@@ -243,23 +279,26 @@ def learn_kernels(
         weight: of the first kernels (coordinates; a point in a class counts three).
         iterations: rounds; every one costs about as much as a gradient.
     """
-    rows, target, frame, _ = _rows(packed, path, noise)
-    frames = prior.kernels.shape[-1]
-    index = (frame[:, :, None] * frames + frame[:, None, :]).flatten()
-    products = rows @ rows.mT
-    first = prior.kernels
+    first, frames = prior.kernels, prior.kernels.shape[-1]
+    batches = []
+    for _, batch in packed.batches:
+        rows, target, frame, _ = _rows(batch, path, noise)
+        pairs = frame[:, :, None] * frames + frame[:, None, :]
+        batches.append((rows, target, frame, pairs.flatten(), rows @ rows.mT))
     for _ in range(iterations):
-        parts = [_factor(rows, target, frame, prior, c) for c in range(len(prior.kernels))]
-        joint = torch.stack([part[3] for part in parts]) + prior.log_share[:, None]
-        share = (joint - torch.logsumexp(joint, 0)).exp()
-        kernels = []
-        for c, (_, factor, solved, _) in enumerate(parts):
-            excess = solved[:, :, None] * solved[:, None, :] - torch.cholesky_inverse(factor)
-            slope = rows.new_zeros(frames * frames)
-            slope.index_add_(0, index, (share[c][:, None, None] * excess * products).flatten())
-            kernel, count = prior.kernels[c], 3 * share[c].sum()
-            moved = count * kernel + kernel @ slope.view(frames, frames) @ kernel
-            kernels.append((weight * first[c] + (moved + moved.mT) / 2) / (weight + count))
-        members = share.sum(1) + 1
-        prior = MotionPrior(prior.rest, torch.stack(kernels), torch.log(members / members.sum()))
+        slope = torch.zeros_like(first).flatten(1)
+        members = first.new_zeros(len(first))
+        for rows, target, frame, index, products in batches:
+            parts = [_factor(rows, target, frame, prior, c) for c in range(len(first))]
+            joint = torch.stack([part[3] for part in parts]) + prior.log_share[:, None]
+            share = (joint - torch.logsumexp(joint, 0)).exp()
+            members += share.sum(1)
+            for c, (_, factor, solved, _) in enumerate(parts):
+                excess = solved[:, :, None] * solved[:, None, :] - torch.cholesky_inverse(factor)
+                slope[c].index_add_(0, index, (share[c][:, None, None] * excess * products).flatten())
+        count = 3 * members[:, None, None]
+        kernel = prior.kernels
+        moved = count * kernel + kernel @ slope.view_as(kernel) @ kernel
+        kernels = (weight * first + (moved + moved.mT) / 2) / (weight + count)
+        prior = MotionPrior(prior.rest, kernels, torch.log((members + 1) / (members + 1).sum()))
     return prior

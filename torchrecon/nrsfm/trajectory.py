@@ -33,7 +33,7 @@ from torchrecon.nrsfm.likelihood import (
     posterior_points,
 )
 from torchrecon.nrsfm.observations import Observations, observe
-from torchrecon.nrsfm.turning import RigidTurn, TurnParams, rigid_turns, rigid_under
+from torchrecon.nrsfm.turning import RigidTurn, TurnParams, longest, rigid_turns, rigid_under
 
 __all__ = ["FoundPath", "TrajectoryParams", "find_path", "place_points", "solve_trajectories", "thinning", "trajectory"]
 
@@ -53,7 +53,6 @@ class TrajectoryParams:
         turn: of the search for the turn of a rigid body.
         narrow: field of view that stands for parallel rays (radians per rms size).
         entries: observations per point that the search uses at most; frames are thinned to reach it (count).
-        search_points: longest tracks that the search for the path uses (count).
         iterations: descent steps of the translation (count).
         drift: standard deviation of the translation about that of the rigid body (rms sizes).
         drift_memory: its time scale (seconds).
@@ -75,7 +74,6 @@ class TrajectoryParams:
     turn: TurnParams = field(default_factory=TurnParams)
     narrow: float = 0.01
     entries: int = 16
-    search_points: int = 300
     iterations: int = 12
     drift: float = 0.3
     drift_memory: float = 0.4
@@ -228,7 +226,7 @@ def find_path(data: Observations, params: TrajectoryParams) -> FoundPath:
     noise = params.inflation if data.noise_known else params.default_noise
     packed = pack(data, thinning(data, params))
     seen = int(packed.seen.sum())
-    order = torch.argsort(packed.seen.sum(1), descending=True, stable=True)[: params.search_points]
+    order = longest(packed.seen.T, params.turn.search_points)
     search = packed.select(order)
     upright = data.xy.new_tensor([0.0, 1.0, 0.0])
 

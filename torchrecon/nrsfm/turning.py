@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from torchrecon._typing import Bool, Float, Tensor
+from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.errors import ReconError
 from torchrecon.linalg import rotation_from_vector, skew
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.measurement.camera import normalised_coordinates
 
-__all__ = ["RigidTurn", "TurnParams", "rigid_turns", "rigid_under", "turning_rigid"]
+__all__ = ["RigidTurn", "TurnParams", "longest", "rigid_turns", "rigid_under", "turning_rigid"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class TurnParams:
         together: observations of one track err together while a limb moves; so many count as one.
         outlier: residual at which an observation counts half (rms sizes of the body in the image).
         ridge: pull of the shape to its centre where a point is hardly seen (observations).
+        search_points: longest tracks that the search for the turn uses (count).
     """
 
     rates: tuple[float, ...] = (25.0, 50.0, 75.0, 100.0, 125.0, 150.0, 175.0, 200.0)
@@ -49,6 +50,7 @@ class TurnParams:
     together: float = 10.0
     outlier: float = 0.16
     ridge: float = 1e-2
+    search_points: int = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +169,17 @@ def _outlier(plane: Tensor, visible: Tensor, params: TurnParams) -> float:
     return params.outlier * float((((seen - middle) * weight).square().sum() / (2 * weight.sum())).sqrt())
 
 
+def longest(visible: Bool[Tensor, "frames points"], count: int) -> Int[Tensor, " kept"]:
+    """Indices of the longest tracks, which say most about a turn.
+
+    Example:
+        >>> import torch
+        >>> longest(torch.tensor([[True, True, False], [False, True, False]]), 2).tolist()
+        [1, 0]
+    """
+    return torch.argsort(visible.sum(0), descending=True, stable=True)[:count]
+
+
 def rigid_under(
     plane: Float[Tensor, "frames points 2"],
     visible: Bool[Tensor, "frames points"],
@@ -238,14 +251,17 @@ def rigid_turns(
                 rotations = rotation_from_vector(seconds[:, None] * (sense * math.radians(rate)) * axis)
                 tried.append((rigid_under(plane, visible, rotations, p), axis))
         found += sorted(tried, key=lambda turn: turn[0].cost)[: p.kept]
-    outlier = _outlier(plane, visible, p)
-    refined = []
-    for turn, axis in found:
-        for _ in range(p.refinements):
-            turn = _robust(turn, outlier)
-            turn = _fit_rotations(_fit_translation(_fit_shape(turn, p.ridge)), axis, fps, p)
-        refined.append(_robust(_fit_translation(_fit_shape(turn, p.ridge)), outlier))
+    refined = [_refined(turn, axis, fps, p) for turn, axis in found]
     return sorted(refined, key=lambda turn: turn.cost)
+
+
+def _refined(turn: RigidTurn, axis: Tensor, fps: float, params: TurnParams) -> RigidTurn:
+    """Shape, translations and rotations in turn, far residuals counting less."""
+    outlier = _outlier(turn.plane, turn.weight > 0, params)
+    for _ in range(params.refinements):
+        turn = _robust(turn, outlier)
+        turn = _fit_rotations(_fit_translation(_fit_shape(turn, params.ridge)), axis, fps, params)
+    return _robust(_fit_translation(_fit_shape(turn, params.ridge)), outlier)
 
 
 def turning_rigid(tracks: Tracks, params: TurnParams | None = None) -> Reconstruction:
@@ -273,7 +289,12 @@ def turning_rigid(tracks: Tracks, params: TurnParams | None = None) -> Reconstru
     if tracks.intrinsics is None:
         raise ReconError("turning_rigid: the tracks have no intrinsics, and perspective is what tells the sense")
     plane = normalised_coordinates(torch.nan_to_num(tracks.xy), tracks.intrinsics)
-    best = rigid_turns(plane, tracks.visible, tracks.fps, params=params)[0]
+    p = params or TurnParams()
+    search = longest(tracks.visible, p.search_points)
+    found = rigid_turns(plane[:, search], tracks.visible[:, search], tracks.fps, params=p)[0]
+    # The longest tracks find the turn; all of them then have their say.
+    whole = rigid_under(plane, tracks.visible, found.rotations, p)
+    best = _refined(whole, plane.new_tensor([0.0, 1.0, 0.0]), tracks.fps, replace(p, refinements=p.rounds))
     pixels = best.cost**0.5 * float(tracks.intrinsics[0, 0])
     turned = float(torch.rad2deg(_steps(best.rotations).norm(dim=-1).sum()))
     return Reconstruction.from_points(
