@@ -11,7 +11,7 @@ import torch
 from torchrecon.errors import ReconError
 from torchrecon.linalg.noise_edge import complement_basis, count_signals, spectrum, tracy_widom_edge
 from torchrecon.measurement import Tracks, stack_matrix, vector_matrix
-from torchrecon.rank import cross_validate, estimate_rank
+from torchrecon.rank import RULES, cross_validate, estimate_rank
 
 
 def _smooth(frames: int, count: int, cycles: int, g: torch.Generator) -> torch.Tensor:
@@ -239,7 +239,7 @@ def test_scale_rotation_and_precision_do_not_matter() -> None:
         )
 
 
-@pytest.mark.parametrize("rule", ["mp", "tracy_widom", "kritchman_nadler", "mdl", "cross_validation"])
+@pytest.mark.parametrize("rule", [rule for rule in RULES if rule not in ("auto", "paper")])
 def test_every_rule_finds_a_clear_answer_and_keeps_the_contract(rule: str) -> None:
     xy, _, sigma = _scene(200, 60, 3, 30.0, 0)
     tracks = Tracks(xy, covariance=_isotropic(xy, sigma))
@@ -250,6 +250,33 @@ def test_every_rule_finds_a_clear_answer_and_keeps_the_contract(rule: str) -> No
     assert estimate_rank(tracks, rule, max_rank=2).rank <= 2
     if rule in ("mp", "tracy_widom"):
         assert estimate_rank(tracks, rule, noise_scale="given").rank == 3
+
+
+def test_bootstrap_interval_holds_k_and_its_edge_is_that_of_the_noise() -> None:
+    inside, exact = [], []
+    for seed in range(10):
+        xy, _, _ = _scene(60, 30, 3, 10.0, seed)
+        estimate = estimate_rank(Tracks(xy), "bootstrap")
+        low, high = estimate.interval
+        inside.append(low <= 3 <= high)
+        assert low <= estimate.rank <= high
+        _, _, sigma = _scene(60, 30, 1, 10.0, seed)
+        noise = sigma * torch.randn(60, 30, 2, generator=torch.Generator().manual_seed(seed))
+        exact.append(6 * float(estimate_rank(Tracks(noise), "bootstrap", "vector").deformation_degree))
+    assert sum(inside) >= 9
+    assert sum(count > 0 for count in exact) <= 3  # one in twenty is expected
+
+
+def test_bootstrap_knows_correlated_noise_that_the_closed_form_takes_for_signal() -> None:
+    xy, _, sigma = _scene(150, 40, 2, 20.0, 0)
+    g = torch.Generator().manual_seed(1)
+    level = torch.exp(0.7 * torch.randn(150, 40, generator=g))
+    slant = torch.tensor([[1.0, 0.0], [0.9, 0.44]])
+    factor = sigma * level[..., None, None] * slant
+    noisy = xy + (factor @ torch.randn(150, 40, 2, 1, generator=g))[..., 0]
+    tracks = Tracks(noisy, covariance=factor @ factor.mT + sigma**2 * torch.eye(2))
+    assert estimate_rank(tracks, "bootstrap", noise_scale="given").rank == 2
+    assert estimate_rank(tracks, "tracy_widom", noise_scale="given").rank == 3
 
 
 def test_unequal_points_need_the_covariance() -> None:

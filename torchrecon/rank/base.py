@@ -16,9 +16,11 @@ __all__ = [
     "Spectrum",
     "complete_points",
     "covariance_scales",
+    "equal_blocks",
     "stack_spectrum",
     "vector_spectrum",
     "whitened_stack",
+    "whitened_vectors",
 ]
 
 # eigenvalues per shape basis: three coordinates in the stack 2F x P, six rotation entries in the vectors F x 2P
@@ -89,22 +91,34 @@ def stack_spectrum(xy: Float[Tensor, "frames points 2"], frame: Tensor, point: T
     return Spectrum(values, samples, "stack", floor / float((frame.min() * point.min()) ** 2))
 
 
-def vector_spectrum(
-    xy: Float[Tensor, "frames points 2"], blocks: Float[Tensor, "points 2 2"] | None, floor: float
-) -> Spectrum:
-    """Spectrum of the F x (2P-2) matrix of vectors, each point whitened by its own 2x2 factor (paper, eqs. 23-25)."""
-    points = xy.shape[1]
-    if blocks is None:
-        blocks = torch.eye(2, dtype=xy.dtype, device=xy.device).expand(points, 2, 2)
+def equal_blocks(xy: Float[Tensor, "frames points 2"]) -> Float[Tensor, "points 2 2"]:
+    """Covariance blocks of points that are all as noisy."""
+    return torch.eye(2, dtype=xy.dtype, device=xy.device).expand(xy.shape[1], 2, 2)
+
+
+def whitened_vectors(
+    xy: Float[Tensor, "frames points 2"], blocks: Float[Tensor, "points 2 2"]
+) -> Float[Tensor, "frames cols"]:
+    """The F x (2P-2) matrix of vectors, each point whitened by its own 2x2 factor, without translation (eqs. 23-25).
+
+    Raises:
+        ReconError: a block is not positive definite.
+    """
     factor, info = torch.linalg.cholesky_ex(blocks.to(xy.dtype))
     if (info != 0).any():
         raise ReconError(f"covariance: the mean of point {int(info.nonzero()[0])} is not positive definite")
     white = torch.linalg.solve_triangular(factor, xy[..., None], upper=False)[..., 0]
     # what a translation in u and one in v look like after whitening; their complement carries no translation
-    unit = torch.eye(2, dtype=xy.dtype, device=xy.device).expand(points, 2, 2)
-    moved = torch.linalg.solve_triangular(factor, unit, upper=False)
+    moved = torch.linalg.solve_triangular(factor, equal_blocks(xy), upper=False)
     translation = torch.stack([moved[:, :, axis].T.flatten() for axis in (0, 1)], -1)
     full, _ = torch.linalg.qr(translation, mode="complete")
-    values, samples, _ = spectrum(vector_matrix(white) @ full[:, 2:])
+    return vector_matrix(white) @ full[:, 2:]
+
+
+def vector_spectrum(
+    xy: Float[Tensor, "frames points 2"], blocks: Float[Tensor, "points 2 2"], floor: float
+) -> Spectrum:
+    """Spectrum of the whitened vectors (paper, eqs. 23-25)."""
+    values, samples, _ = spectrum(whitened_vectors(xy, blocks))
     smallest = float(torch.linalg.eigvalsh(blocks).min())
     return Spectrum(values, samples, "vector", floor / smallest)

@@ -15,11 +15,16 @@ from torchrecon.rank.base import (
     Spectrum,
     complete_points,
     covariance_scales,
+    equal_blocks,
     rounding_floor,
     stack_spectrum,
     vector_spectrum,
+    whitened_stack,
+    whitened_vectors,
 )
+from torchrecon.rank.bootstrap import BootstrapCount, bootstrap_count
 from torchrecon.rank.cross_validation import cross_validate
+from torchrecon.rank.gavish_donoho import gavish_donoho_count
 from torchrecon.rank.kritchman_nadler import kritchman_nadler, kritchman_nadler_count
 from torchrecon.rank.mdl import mdl_count
 from torchrecon.rank.mp import mp_count
@@ -28,7 +33,17 @@ from torchrecon.rank.tracy_widom import tracy_widom_count
 
 __all__ = ["RULES", "estimate_rank"]
 
-RULES = ("auto", "paper", "mp", "tracy_widom", "kritchman_nadler", "mdl", "cross_validation")
+RULES = (
+    "auto",
+    "paper",
+    "mp",
+    "tracy_widom",
+    "kritchman_nadler",
+    "mdl",
+    "gavish_donoho",
+    "bootstrap",
+    "cross_validation",
+)
 # `auto` trusts the complete points when they are at least this many and this share of all
 _ENOUGH_POINTS = 12
 _ENOUGH_SHARE = 0.5
@@ -53,13 +68,14 @@ def estimate_rank(
     Args:
         tracks: any batch shape; items are treated one by one.
         rule: ``auto``; ``paper`` (eqs. 25-27 as printed: vector layout, given noise scale, needs covariance); ``mp``;
-            ``tracy_widom``; ``kritchman_nadler``; ``mdl``; ``cross_validation``.
+            ``tracy_widom``; ``kritchman_nadler``; ``mdl``; ``gavish_donoho``; ``bootstrap`` (its interval covers K in
+            95 % of cases); ``cross_validation``.
         layout: ``stack`` (2F x P, rank 3K under any motion) or ``vector`` (F x 2P, rank 6K only under rotation about
             three axes). Default: ``stack``, for ``paper`` ``vector``.
         noise_scale: ``estimate``: the covariance is right up to one factor; ``given``: it is right as it stands.
             ``paper`` always takes it as given.
         max_rank: largest K to report.
-        generator: randomness of ``cross_validation``; default: seed 0.
+        generator: randomness of ``cross_validation`` and ``bootstrap``; default: seed 0.
 
     Returns:
         eigenvalues and threshold of a batch are padded with zeros and NaN; ``cross_validation`` has no threshold (NaN)
@@ -140,7 +156,7 @@ def _single(
         enough = found == tracks.points or (found >= _ENOUGH_POINTS and found >= _ENOUGH_SHARE * tracks.points)
         rule = "kritchman_nadler" if enough else "cross_validation"
         if rule == "kritchman_nadler" and found < tracks.points:
-            estimate = _spectral(tracks, rule, layout or "stack", noise_scale, max_rank, [])
+            estimate = _spectral(tracks, rule, layout or "stack", noise_scale, max_rank, generator, [])
             # a count near the limit of few points says "at least"; the incomplete points know more
             if float(estimate.deformation_degree) * DIVISOR[estimate.layout] > 0.6 * (found - 1):
                 rule = "cross_validation"
@@ -152,12 +168,18 @@ def _single(
             "rule 'cross_validation' uses them."
         )
     return _spectral(
-        tracks, rule, layout or ("vector" if rule == "paper" else "stack"), noise_scale, max_rank, warnings
+        tracks, rule, layout or ("vector" if rule == "paper" else "stack"), noise_scale, max_rank, generator, warnings
     )
 
 
 def _spectral(
-    tracks: Tracks, rule: str, layout: str, noise_scale: str, max_rank: int | None, warnings: list[str]
+    tracks: Tracks,
+    rule: str,
+    layout: str,
+    noise_scale: str,
+    max_rank: int | None,
+    generator: torch.Generator | None,
+    warnings: list[str],
 ) -> RankEstimate:
     xy = complete_points(tracks)
     frames, points = xy.shape[:2]
@@ -175,14 +197,27 @@ def _spectral(
     frame, point = xy.new_ones(frames), xy.new_ones(points)
     if covariance is not None:
         frame, point = covariance_scales(covariance)
+    given, blocks = frame[:, None] * point, equal_blocks(xy)
     if layout == "vector":
-        blocks = None if covariance is None else covariance.mean(0)
+        blocks = blocks if covariance is None else covariance.mean(0)
         spectrum_ = vector_spectrum(xy, blocks, floor)
-    elif rule == "kritchman_nadler" and noise_scale == "estimate":
+    elif rule in ("kritchman_nadler", "bootstrap") and noise_scale == "estimate":
         spectrum_, frame, point = kritchman_nadler(xy, frame, point, floor)
     else:
         spectrum_ = stack_spectrum(xy, frame, point, floor)
-    count, eigenvalues, threshold = _count(spectrum_, rule, noise_scale, frames)
+    divisor = DIVISOR[layout]
+    if rule == "bootstrap":
+        factor = torch.linalg.cholesky(equal_blocks(xy) if covariance is None else covariance)
+        # what the residuals say beyond the covariance is in the noise that is drawn as well
+        factor = factor * (frame[:, None] * point / given)[..., None, None]
+        scales = blocks if layout == "vector" else (frame, point)
+        drawn = _bootstrapped(xy, factor, scales, noise_scale, spectrum_.floor, generator)
+        count, eigenvalues, threshold = drawn.count, drawn.eigenvalues, drawn.threshold
+        low, high = drawn.interval
+    else:
+        count, eigenvalues, threshold = _count(spectrum_, rule, noise_scale, frames)
+        low = count_signals(spectrum_.values, spectrum_.samples, None, 0.999)[0]
+        high = count_signals(spectrum_.values, spectrum_.samples, None, 0.5)[0]
     if layout == "stack" and rule != "paper":
         warnings += _static_view(xy, floor, count)
     if count >= 0.8 * len(eigenvalues) and rule != "paper":
@@ -190,9 +225,6 @@ def _spectral(
             f"{count} of {len(eigenvalues)} eigenvalues stand above the noise: the tracks are almost free of noise, or "
             "too few for their deformation; K is a lower limit set by the number of points and frames."
         )
-    divisor = DIVISOR[layout]
-    low = count_signals(spectrum_.values, spectrum_.samples, None, 0.999)[0]
-    high = count_signals(spectrum_.values, spectrum_.samples, None, 0.5)[0]
     limits = sorted((_round(low, divisor, max_rank), _round(count, divisor, max_rank), _round(high, divisor, max_rank)))
     return RankEstimate(
         _round(count, divisor, max_rank),
@@ -204,6 +236,27 @@ def _spectral(
         layout,
         tuple(warnings),
     )
+
+
+def _bootstrapped(
+    xy: Float[Tensor, "frames points 2"],
+    factor: Tensor,
+    scales: Tensor | tuple[Tensor, Tensor],
+    noise_scale: str,
+    floor: float,
+    generator: torch.Generator | None,
+) -> BootstrapCount:
+    """Bootstrap with noise of covariance ``factor factor^T``; ``scales`` whiten the stack (a pair) or the vectors."""
+    generator = generator if generator is not None else torch.Generator().manual_seed(0)
+
+    def whiten(values: Tensor) -> Tensor:
+        return whitened_stack(values, *scales)[0] if isinstance(scales, tuple) else whitened_vectors(values, scales)
+
+    def draw() -> Tensor:
+        white = torch.randn(xy.shape, generator=generator, dtype=xy.dtype).to(xy.device)
+        return whiten((factor @ white[..., None])[..., 0])
+
+    return bootstrap_count(whiten(xy), draw, 1.0 if noise_scale == "given" else None, floor)
 
 
 def _round(count: int, divisor: int, max_rank: int | None) -> int:
@@ -222,6 +275,8 @@ def _count(spectrum_: Spectrum, rule: str, noise_scale: str, frames: int) -> tup
         count, threshold = mp_count(values, samples, noise)
     elif rule == "tracy_widom":
         count, threshold = tracy_widom_count(values, samples, noise)
+    elif rule == "gavish_donoho":
+        count, threshold = gavish_donoho_count(values, samples, noise)
     else:
         count, threshold = mdl_count(values, samples)
     return count, values, threshold
@@ -229,7 +284,7 @@ def _count(spectrum_: Spectrum, rule: str, noise_scale: str, frames: int) -> tup
 
 def _static_view(xy: Float[Tensor, "frames points 2"], floor: float, stack_count: int) -> list[str]:
     """A view without rotation has twice as many components in the stack as in the vectors."""
-    vectors, _ = kritchman_nadler_count(vector_spectrum(xy, None, floor))
+    vectors, _ = kritchman_nadler_count(vector_spectrum(xy, equal_blocks(xy), floor))
     if stack_count >= 2 and abs(stack_count - 2 * vectors) <= 0.1 * stack_count:
         return [
             f"The stack 2F x P shows {stack_count} components and the vectors F x 2P half of them: the body does not "
