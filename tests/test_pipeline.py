@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -18,7 +19,9 @@ from torchrecon.data.synthetic import (
     static_camera,
     turning_camera,
 )
+from torchrecon.errors import ReconError
 from torchrecon.measurement import backproject_points, project_points
+from torchrecon.pipeline.depth import body_depth, with_depth
 
 FRAMES = 20
 
@@ -91,6 +94,21 @@ def test_measured_depth_gives_metres(tmp_path):
     assert distance[points.part >= 0].median() < 0.05
     pixels = project_points(truth[first].to(placed), tracks.intrinsics)
     assert (pixels - tracks.xy[first][tracks.visible[first]])[points.part >= 0].norm(dim=-1).median() < 0.1
+
+
+def test_a_frame_out_of_the_sensors_range_has_no_body_and_no_depth_at_all_is_an_error():
+    k = torch.tensor([[50.0, 0, 16], [0, 50, 16], [0, 0, 1]])
+    mask = torch.zeros(32, 32, dtype=torch.bool)
+    mask[8:24, 8:24] = True
+    near, far = torch.full((32, 32), 2.0), torch.full((32, 32), math.nan)
+    assert body_depth(near, mask, k).body.sum() > 100
+    assert not body_depth(far, mask, k).body.any()
+    assert not body_depth(far, None, k).body.any()
+    tracks = tr.Tracks(torch.full((2, 4, 2), 16.0))
+    depth = with_depth(tracks, [near, far], k).depth
+    assert torch.isfinite(depth[0]).all() and not torch.isfinite(depth[1]).any()
+    with pytest.raises(ReconError, match="depth: no tracked point"):
+        with_depth(tracks, [far, far], k)
 
 
 def test_counts_that_do_not_fit_are_named(tmp_path, capsys):

@@ -3,67 +3,23 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import scipy.integrate
 import torch
 
+from eval.reliability.world import low_rank_tracks
 from torchrecon.errors import ReconError
 from torchrecon.linalg.noise_edge import complement_basis, count_signals, spectrum, tracy_widom_edge
 from torchrecon.measurement import Tracks, stack_matrix, vector_matrix
 from torchrecon.rank import RULES, cross_validate, estimate_rank
 
 
-def _smooth(frames: int, count: int, cycles: int, g: torch.Generator) -> torch.Tensor:
-    """Band-limited random curves of unit variance, (count, frames)."""
-    t = torch.arange(frames) / frames
-    k = torch.arange(cycles + 1)
-    amplitude = torch.randn(count, cycles + 1, 1, generator=g)
-    phase = 2 * math.pi * torch.rand(count, cycles + 1, 1, generator=g)
-    x = (amplitude * torch.cos(2 * math.pi * k[:, None] * t + phase)).sum(1)
-    x = x - x.mean(1, keepdim=True)
-    return x / x.std(1, keepdim=True)
-
-
-def _rotations(vectors: torch.Tensor) -> torch.Tensor:
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(*x.shape, 3, 3)
-    return torch.linalg.matrix_exp(cross)
-
-
-def _scene(
-    frames: int,
-    points: int,
-    bases: int,
-    snr: float,
-    seed: int,
-    motion: str = "generic",
-    frame_spread: float = 0.0,
-    missing: float = 0.0,
-) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """Orthographic tracks of a body with ``bases`` shape bases: xy, visible, noise standard deviation."""
-    g = torch.Generator().manual_seed(seed)
-    shapes = torch.randn(bases, 3, points, generator=g)
-    shapes = shapes - shapes.mean(-1, keepdim=True)
-    weights = torch.cat(
-        [1 + 0.2 * _smooth(frames, 1, 4, g)] + [0.5 * 0.8**k * _smooth(frames, 1, 4, g) for k in range(1, bases)]
-    )
-    if motion == "generic":
-        turn = 1.2 * _smooth(frames, 3, 3, g).T
-    else:
-        angle = 2 * math.pi * torch.arange(frames) / frames * (motion == "yaw")
-        turn = torch.stack([0 * angle, angle, 0 * angle], -1)
-    body = torch.einsum("kf,kap->fap", weights, shapes)
-    xy = 30 * (_rotations(turn) @ body)[:, :2].transpose(1, 2)
-    sigma = float(xy.pow(2).mean().sqrt()) * 10 ** (-snr / 20)
-    level = torch.exp(frame_spread * torch.randn(frames, 1, 1, generator=g))
-    noise = sigma * level / level.pow(2).mean().sqrt() * torch.randn(frames, points, 2, generator=g)
-    visible = torch.ones(frames, points, dtype=torch.bool)
-    while float((~visible).double().mean()) < missing:
-        p, start, length = (int(torch.randint(high, (1,), generator=g)) for high in (points, frames, 13))
-        visible[start : start + length + 3, p] = False
-    return xy + noise + 40 * _smooth(frames, 2, 2, g).T[:, None] + 300, visible, sigma
+def _scene(*arguments: Any, **options: Any) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Tracks of a body of known K: xy, visible, noise standard deviation."""
+    made = low_rank_tracks(*arguments, **options)
+    return made.xy, made.visible, made.sigma
 
 
 def _isotropic(xy: torch.Tensor, sigma: float) -> torch.Tensor:

@@ -187,11 +187,8 @@ def _bodies(
 ) -> Iterator[Bool[Tensor, "height width"]]:
     """Body pixels frame by frame; the filtered depth images are kept in ``filtered`` on the way."""
     pairs = ((d, None) for d in depths) if masks is None else zip(depths, masks, strict=True)
-    for index, (image, mask) in enumerate(pairs):
-        try:
-            found = body_depth(image, mask, intrinsics, config.depth)
-        except ReconError as error:
-            raise ReconError(f"frame {index}: {error}") from error
+    for image, mask in pairs:
+        found = body_depth(image, mask, intrinsics, config.depth)
         filtered.append(found.depth)
         yield found.body
 

@@ -1,0 +1,96 @@
+"""Rates and coverage of every estimate: ``python -m eval.reliability [--data ../shared/data]``.
+
+Parts: ``rank`` (K by every rule over the grid of the specification, motions, gaps, the paper's closed form),
+``filling`` (gaps of a lost joint, by length). Without ``--data`` on the synthetic world alone. ``--smoke``: a small
+run that ends in a minute; ``--full``: the costly rules on the whole grid. Writes reliability.json and reliability.txt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from eval.job import ROOT, provenance, write_json, write_text
+from eval.reliability.filling import measure_filling
+from eval.reliability.ranks import measure_ranks
+from torchrecon.errors import ReconError
+
+__all__ = ["main"]
+
+PARTS = ("rank", "filling")
+_SMOKE = {
+    "grid": {"frames": [50, 100], "points": [30], "trials": 1},
+    "costly": {"trials": 1, "cells": [[50, 30, 2, 20.0], [100, 30, 3, 10.0]]},
+    "side": {"frames": 80, "trials": 1},
+    "rigid": {"trials": 4},
+    "gaps": {"shares": [0.1], "trials": 1},
+    "paper": {"trials": 2},
+    "filling": {"films": 3, "lengths": [1, 5, 12]},
+}
+
+
+def read_config(path: Path, smoke: bool) -> dict[str, Any]:
+    """The grid of experiments, cut down for a smoke run.
+
+    Raises:
+        ReconError: the file is missing or lacks a part.
+    """
+    if not path.is_file():
+        raise ReconError(f"{path}: no such file; give a config as configs/reliability.yaml is")
+    config: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    missing = sorted(set(_SMOKE) - set(config or {}))
+    if missing:
+        raise ReconError(f"{path}: has no part {missing[0]!r}; see configs/reliability.yaml")
+    if smoke:
+        for part, small in _SMOKE.items():
+            config[part].update(small)
+    return config
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of the job; exit code 2 with one sentence for input that cannot be used."""
+    parser = argparse.ArgumentParser(prog="python -m eval.reliability", description=__doc__.split("\n")[0])
+    parser.add_argument("--data", metavar="DIR", help="folder with mocap/ and keypoints/: real motion beside synthetic")
+    parser.add_argument("--only", choices=PARTS, action="append", help="this part only; may be repeated")
+    parser.add_argument("--smoke", action="store_true", help="small: ends in a minute")
+    parser.add_argument("--full", action="store_true", help="bootstrap and cross-validation on the whole grid")
+    parser.add_argument("--config", metavar="FILE", default=str(ROOT / "configs" / "reliability.yaml"))
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("-o", "--out", metavar="DIR", default="runs/reliability")
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    torch.set_default_dtype(torch.float64)
+    started = time.perf_counter()
+    out = Path(arguments.out)
+    data = None if arguments.data is None else Path(arguments.data)
+    result: dict[str, Any] = {}
+    text: list[str] = []
+    try:
+        config = read_config(Path(arguments.config), arguments.smoke)
+        for part in arguments.only or PARTS:
+            at = time.perf_counter()
+            if part == "rank":
+                result[part], lines = measure_ranks(config, arguments.full, arguments.workers)
+            else:
+                result[part], lines = measure_filling(config, data, arguments.workers)
+            title = f"== {part}{' (SMOKE)' if arguments.smoke else ''}, {time.perf_counter() - at:.0f} s =="
+            text += [title, *lines, ""]
+            # What is done is kept if a later part fails.
+            write_json(out / "reliability.json", {**result, "config": config, "provenance": provenance("cpu", 0)})
+            write_text(out / "reliability.txt", "\n".join(text))
+    except ReconError as error:
+        print(f"eval.reliability: {error}", file=sys.stderr)
+        return 2
+    print("\n".join(text))
+    print(f"wrote {out}/reliability.json, reliability.txt after {time.perf_counter() - started:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
