@@ -106,7 +106,8 @@ def test_a_frame_out_of_the_sensors_range_has_no_body_and_no_depth_at_all_is_an_
     assert not body_depth(far, None, k).body.any()
     tracks = tr.Tracks(torch.full((2, 4, 2), 16.0))
     depth = with_depth(tracks, [near, far], k).depth
-    assert torch.isfinite(depth[0]).all() and not torch.isfinite(depth[1]).any()
+    assert torch.isfinite(depth[0]).all()
+    assert not torch.isfinite(depth[1]).any()
     with pytest.raises(ReconError, match="depth: no tracked point"):
         with_depth(tracks, [far, far], k)
 
