@@ -2,7 +2,8 @@
 
 Parts: ``rank`` (K by every rule over the grid of the specification, motions, gaps, the paper's closed form),
 ``filling`` (gaps of a lost joint, by length). Without ``--data`` on the synthetic world alone. ``--smoke``: a small
-run that ends in a minute; ``--full``: the costly rules on the whole grid. Writes reliability.json and reliability.txt.
+run that ends in a minute; ``--full``: the costly rules on the whole grid. Writes reliability.json, reliability.txt and
+reliability.png.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import torch
 import yaml
 
 from eval.job import ROOT, provenance, write_json, write_text
-from eval.reliability.filling import measure_filling
-from eval.reliability.ranks import measure_ranks
+from eval.reliability.filling import draw_filling, measure_filling
+from eval.reliability.ranks import draw_ranks, measure_ranks
 from torchrecon.errors import ReconError
 
 __all__ = ["main"]
@@ -53,6 +54,23 @@ def read_config(path: Path, smoke: bool) -> dict[str, Any]:
     return config
 
 
+def _draw(result: dict[str, Any], path: Path) -> None:
+    """A panel for each part that was run."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(result), figsize=(6.5 * len(result), 4.5), squeeze=False, layout="constrained")
+    for ax, part in zip(axes[0], result, strict=True):
+        if part == "rank":
+            draw_ranks(result[part]["records"], ax)
+        else:
+            draw_filling(result[part]["records"], ax)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Command line of the job; exit code 2 with one sentence for input that cannot be used."""
     parser = argparse.ArgumentParser(prog="python -m eval.reliability", description=__doc__.split("\n")[0])
@@ -84,11 +102,12 @@ def main(argv: list[str] | None = None) -> int:
             # What is done is kept if a later part fails.
             write_json(out / "reliability.json", {**result, "config": config, "provenance": provenance("cpu", 0)})
             write_text(out / "reliability.txt", "\n".join(text))
+        _draw(result, out / "reliability.png")
     except ReconError as error:
         print(f"eval.reliability: {error}", file=sys.stderr)
         return 2
     print("\n".join(text))
-    print(f"wrote {out}/reliability.json, reliability.txt after {time.perf_counter() - started:.0f} s")
+    print(f"wrote {out}/reliability.json, .txt and .png after {time.perf_counter() - started:.0f} s")
     return 0
 
 

@@ -15,7 +15,7 @@ from eval.reliability.motions import Joints2D, humaneva_joints, mocap_joints, sy
 from torchrecon.gaps import fill_gaps
 from torchrecon.measurement import Tracks
 
-__all__ = ["measure_filling"]
+__all__ = ["draw_filling", "measure_filling"]
 
 METHODS = ("auto", "abg", "rts", "low_rank")
 _LOST = 10.0  # pixels: an error beyond it is a catastrophe unless it is flagged
@@ -102,6 +102,18 @@ def _lines(records: list[dict[str, Any]], lengths: Sequence[int]) -> list[str]:
             f"them unflagged ({'hit' if rates[1] < 1 else 'MISSED'}, under 1); flagged {rates[2]:.0f}"
         )
     return lines
+
+
+def draw_filling(records: Sequence[Mapping[str, Any]], ax: Any) -> None:
+    """Median error against the length of the gap, all sources together."""
+    lengths = sorted({r["length"] for r in records})
+    for method in METHODS:
+        of = [[r["square"] for r in records if r["method"] == method and r["length"] == n] for n in lengths]
+        medians = [float(torch.tensor(squares).median().sqrt()) for squares in of]
+        ax.plot(lengths, medians, "-" if method == "auto" else "--", marker="o", label=method)
+    ax.set(xlabel="frames in the gap", ylabel="median error inside the gap, px", xscale="log", yscale="log")
+    ax.set_xticks(lengths, [str(n) for n in lengths])
+    ax.legend()
 
 
 def measure_filling(config: Mapping[str, Any], data: Path | None, workers: int) -> tuple[dict[str, Any], list[str]]:

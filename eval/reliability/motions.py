@@ -16,7 +16,7 @@ from torchrecon.data.synthetic import ACTIONS, sample_body, sample_motion
 __all__ = ["Joints2D", "humaneva_joints", "mocap_joints", "synthetic_joints"]
 
 _HEIGHT = 190.0  # pixels: median height of a body in the image
-_NEAR = 7.0  # metres: of the camera
+_NEAR = 7.0  # metres from the camera at least, and twice as far as the body travels
 _LENGTH = 90  # frames of a synthetic film
 
 
@@ -41,7 +41,9 @@ def _seen(joints: Tensor, azimuth: float) -> Tensor:
     c, s = math.cos(azimuth), math.sin(azimuth)
     turn = joints.new_tensor([[c, 0.0, s], [0.0, -1.0, 0.0], [-s, 0.0, c]])
     middle = joints.mean((0, 1))
-    placed = (joints - middle) @ turn.T + joints.new_tensor([0.0, 0.0, _NEAR])
+    centred = (joints - middle) @ turn.T
+    away = max(_NEAR, 2 * float(centred[..., 2].abs().max()))
+    placed = centred + joints.new_tensor([0.0, 0.0, away])
     plane = placed[..., :2] / placed[..., 2:]
     height = plane[..., 1].amax(1) - plane[..., 1].amin(1)
     return 300 + plane * (_HEIGHT / height.median())

@@ -15,7 +15,7 @@ from eval.job import run_parallel
 from eval.reliability.world import low_rank_tracks
 from torchrecon.rank import estimate_rank
 
-__all__ = ["CLOSED_FORM", "Cell", "grid", "measure_ranks"]
+__all__ = ["CLOSED_FORM", "Cell", "draw_ranks", "grid", "measure_ranks"]
 
 CLOSED_FORM = ("kritchman_nadler", "tracy_widom", "mp", "gavish_donoho", "mdl")
 _SNRS = (30.0, 20.0, 10.0, 0.0)
@@ -268,6 +268,18 @@ def _paper_lines(records: list[dict[str, Any]]) -> list[str]:
             f"with the lost samples {exact:.1f} ({100 * (measured / exact - 1):+.1f} %); K^ = {measured / 6:.1f}"
         )
     return lines
+
+
+def draw_ranks(records: Sequence[Mapping[str, Any]], ax: Any) -> None:
+    """Share of exact K against SNR, over the cells that fit the layout."""
+    of_grid = [r for r in records if r["part"] == "grid" and r["fits"]]
+    for rule, layout in dict.fromkeys((r["rule"], r["layout"]) for r in of_grid):
+        shares = [
+            _share([r for r in of_grid if (r["rule"], r["layout"], r["snr"]) == (rule, layout, snr)]) for snr in _SNRS
+        ]
+        ax.plot(_SNRS, shares, ":" if layout == "vector" else "-", marker="o", label=f"{rule} {layout}")
+    ax.set(xlabel="SNR, dB", ylabel="K exact, % of all cells that fit", ylim=(0, 101))
+    ax.legend(fontsize=7)
 
 
 def measure_ranks(config: Mapping[str, Any], full: bool, workers: int) -> tuple[dict[str, Any], list[str]]:
