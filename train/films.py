@@ -149,13 +149,19 @@ def film_of(body: Body, motion: Motion, label: int, points: int, turn: float | N
 
 
 def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Film:
-    """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 6]``."""
+    """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 6]``.
+
+    A class without clips is performed by the synthetic world.
+    """
     g = torch.Generator().manual_seed(seed)
     label = seed % len(MOCAP_CLASSES)
     of_class = clips[MOCAP_CLASSES[label]]
-    clip = of_class[seed // len(MOCAP_CLASSES) % len(of_class)]
     body = sample_body(g)
-    motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
+    if of_class:
+        clip = of_class[seed // len(MOCAP_CLASSES) % len(of_class)]
+        motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
+    else:
+        motion = sample_motion(MOCAP_CLASSES[label], body, generator=g)
     return film_of(body, motion, label, points, None, g)
 
 
