@@ -139,7 +139,7 @@ def test_smoother_beats_coasting_and_low_rank_beats_both_in_long_gaps() -> None:
                 squares.append(_rms(fill_gaps(Tracks(xy, visible), method).xy, truth, visible) ** 2)
             errors[method, length] = (sum(squares) / len(squares)) ** 0.5
         assert errors["rts", length] < errors["abg", length]
-    assert errors["auto", 1] == errors["rts", 1] < 1.0
+    assert errors["auto", 1] < 1.05 * errors["rts", 1] < 1.0
     assert errors["auto", 8] < min(2.0, errors["rts", 8])
 
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchrecon.data.synthetic import ACTIONS
+from torchrecon.data.mocap import MocapClip
+from torchrecon.data.synthetic import ACTIONS, sample_body, sample_motion
 from torchrecon.errors import ReconError
 from torchrecon.models.recogniser import (
     ReadOut,
@@ -26,7 +27,7 @@ from torchrecon.models.recogniser import (
     yaws_of,
 )
 from torchrecon.models.views import settle
-from train.films import AS_TRACKED, Film, augment
+from train.films import AS_TRACKED, MOCAP_CLASSES, Film, augment, mocap_film
 
 ROOT = Path(__file__).parents[1]
 VIEWS = ReadOut()
@@ -258,6 +259,18 @@ def test_what_is_no_recogniser_is_refused(tmp_path):
         load_recogniser(tmp_path / "bad.safetensors")
     with pytest.raises(ReconError, match="existing folder"):
         save_recogniser(Recogniser(("run",)), tmp_path / "none" / "a.safetensors")
+
+
+def test_a_distractor_without_clips_is_performed_by_the_synthetic_world(generator):
+    body = sample_body(generator)
+    motion = sample_motion("run", body, frames=40, generator=generator)
+    clip = MocapClip(motion.joints, motion.parents, motion.names, 30.0, "run")
+    clips = {name: [clip] for name in MOCAP_CLASSES if name != "dribble"} | {"dribble": []}
+    label = MOCAP_CLASSES.index("dribble")
+    made = mocap_film(label, clips, 60)
+    assert made.label == label
+    assert len(made.points3d) == 60  # the synthetic world's own length, not that of a clip
+    assert len(mocap_film(label + 1, clips, 60).points3d) < 60
 
 
 def test_training_job_ends_with_weights_and_does_nothing_twice(tmp_path):

@@ -122,7 +122,7 @@ class Films(L.LightningDataModule):
         if set(empty) - {"dribble"}:
             raise ReconError(f"{self.file}: no clip of {', '.join(empty)} of 1 s or more is left to train on")
         if empty:  # a distractor, not one of the actions that are scored
-            print(f"{self.file}: no clip of dribble of 1 s or more is left to train on; synthetic ones take their place")
+            print(f"{self.file}: no clip of dribble of 1 s or more is left to train on; synthetic ones stand in")
         return partial(mocap_film, clips=clips, points=self.points)
 
     def validation(self, turn: float, what: str) -> list[Film]:

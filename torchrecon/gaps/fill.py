@@ -23,12 +23,10 @@ class GapParams:
     """Parameters of :func:`fill_gaps`.
 
     Attributes:
-        short: ``auto`` fills gaps of up to this many frames by the smoother.
         alpha: position gain of ``abg``; None chooses it from the innovations.
         low_rank: parameters of the low-rank fillers.
     """
 
-    short: int = 2
     alpha: float | None = None
     low_rank: LowRankParams = field(default_factory=LowRankParams)
 
@@ -42,8 +40,9 @@ def fill_gaps(tracks: Tracks, method: str = "auto", params: GapParams | None = N
     Args:
         tracks: any batch shape; items are treated one by one.
         method: ``abg``: causal coasting, the paper's rule (eqs. 28-30); ``rts``: constant-acceleration smoother;
-            ``low_rank``: windowed low-rank completion and a low-rank model of the sequence; ``auto``: ``rts`` for gaps
-            of one or two frames, else ``low_rank`` (which is ``rts`` again where there are too few points).
+            ``low_rank``: windowed low-rank completion; ``auto``: of both, of a low-rank model of the whole sequence and
+            of their means, what predicts gaps best that are cut into the tracks for the purpose. Where there are too
+            few points ``auto`` and ``low_rank`` are ``rts``.
 
     Returns:
         Measured entries unchanged. The covariance of a filled entry is that of its neighbours in time (eq. 30) plus
@@ -94,15 +93,4 @@ def _single(tracks: Tracks, method: str, params: GapParams) -> FilledTracks:
 def _guess(gaps: Gaps, method: str, params: GapParams) -> Guess:
     if method == "abg":
         return fill_abg(gaps, params.alpha)
-    smooth = fill_rts(gaps)
-    short = gaps.visible | (gaps.inside & (gaps.length <= params.short))
-    if method == "rts" or (method == "auto" and bool(short.all())):
-        return smooth
-    low_rank = fill_low_rank(gaps, params.low_rank)
-    if method == "low_rank":
-        return low_rank
-    return Guess(
-        torch.where(short[..., None], smooth.xy, low_rank.xy),
-        torch.where(short, smooth.growth, low_rank.growth),
-        torch.where(short, smooth.doubtful, low_rank.doubtful),
-    )
+    return fill_rts(gaps) if method == "rts" else fill_low_rank(gaps, params.low_rank, choose=method == "auto")

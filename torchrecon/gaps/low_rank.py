@@ -28,6 +28,8 @@ class LowRankParams:
         missing: largest share of unseen entries in a window.
         disagree: distance between two fillers that makes a value doubtful, pixels.
         bases: K of the sequence model, at most.
+        decoys: gaps that are cut beside each real one to choose a filler (count).
+        tested: share of a point's observations that such gaps may take.
     """
 
     delay: int = 9
@@ -38,21 +40,24 @@ class LowRankParams:
     missing: float = 0.35
     disagree: float = 5.0
     bases: int = 4
+    decoys: int = 12
+    tested: float = 0.3
 
 
 # gaps are judged together with gaps of similar length, frames
 _CLASSES = ((1, 4), (5, 15), (16, 10**9))
 
 
-def fill_low_rank(gaps: Gaps, params: LowRankParams | None = None) -> Guess:
+def fill_low_rank(gaps: Gaps, params: LowRankParams | None = None, choose: bool = True) -> Guess:
     """Values on which all points and frames agree that share a low-rank motion.
 
     Gaps that end have three candidates: completion of a delay-embedded matrix, whose rows hold ``delay`` successive
     frames of all points so that it knows about motion as well as about shape; one probabilistic model of rank 3K for
-    the whole sequence; and the smoother. Which one to trust, and how far, is measured on the sequence itself: gaps
-    of the same length are cut into the same points beside the real ones, and the candidate that predicts those best
-    is taken for each class of lengths, with its mean squared error as the variance. The completion raises the rank
-    step by step, because a high rank from the start can reproduce any first guess.
+    the whole sequence; and the smoother. How far to trust them is measured on the sequence itself: gaps of the same
+    length are cut into the same points beside the real ones. For each class of lengths the candidate, or the mean of
+    two, that predicts those best is taken, with its mean squared error as the variance; without ``choose`` it is the
+    completion (where the size allows it). The completion raises the rank step by step, because a high rank from the
+    start can reproduce any first guess.
 
     Everything before the first and after the last observation of a point comes from the sequence model and is always
     doubtful.
@@ -68,23 +73,25 @@ def fill_low_rank(gaps: Gaps, params: LowRankParams | None = None) -> Guess:
     if not gaps.inside.any():
         return Guess(xy, growth, doubtful)
     candidates = _candidates(gaps, model, params)
-    decoys, length = _decoys(gaps)
+    single = len(candidates)
+    candidates = _with_means(candidates)
+    decoys, length = _decoys(gaps, params)
     errors2 = None
     if decoys.any():
         trial = replace(gaps, visible=gaps.visible & ~decoys, inside=gaps.inside | decoys)
         again = factor_model(trial, params.bases)
         if again is not None:
-            errors2 = ((_candidates(trial, again, params) - gaps.xy) ** 2).sum(-1) / 2
+            errors2 = ((_with_means(_candidates(trial, again, params)) - gaps.xy) ** 2).sum(-1) / 2
     depth = 1 + _depth(gaps.visible).to(xy.dtype)
     for low, high in _CLASSES:
         target = gaps.inside & (gaps.length >= low) & (gaps.length <= high)
         tested = decoys & (length >= low) & (length <= high)
         # without a test the last candidate (completion, where it was possible) is taken and flagged
-        winner, error2 = len(candidates) - 1, float(spread[target].mean()) if target.any() else 0.0
+        winner, error2 = single - 1, float(spread[target].mean()) if target.any() else 0.0
         if errors2 is not None and tested.any():
-            winner = int(errors2[:, tested].mean(1).argmin())
+            winner = int(errors2[:, tested].mean(1).argmin()) if choose else winner
             error2 = float(errors2[winner, tested].mean())
-        apart2 = ((candidates - candidates[winner]) ** 2).sum(-1).sort(0).values[1]
+        apart2 = ((candidates[:single] - candidates[winner]) ** 2).sum(-1).sort(0).values[int(winner < single)]
         unsure = (apart2 > params.disagree**2) | (error2 > params.disagree**2) | (not tested.any())
         xy = torch.where(target[..., None], candidates[winner], xy)
         profile = depth / depth[target].mean() if target.any() else depth
@@ -114,21 +121,31 @@ def _candidates(gaps: Gaps, model: FactorModel, params: LowRankParams) -> Float[
     return torch.stack([smooth, predicted, completed])
 
 
-def _decoys(gaps: Gaps) -> tuple[Bool[Tensor, "frames points"], Int[Tensor, "frames points"]]:
+def _with_means(candidates: Float[Tensor, "n frames points 2"]) -> Float[Tensor, "m frames points 2"]:
+    """The candidates, and the mean of each two: their errors have little to do with each other."""
+    pairs = [(candidates[a] + candidates[b]) / 2 for a in range(len(candidates)) for b in range(a)]
+    return torch.cat([candidates, torch.stack(pairs)])
+
+
+def _decoys(gaps: Gaps, params: LowRankParams) -> tuple[Bool[Tensor, "frames points"], Int[Tensor, "frames points"]]:
     """Gaps of the same lengths in the same points, as near to the real ones as there are observations for them."""
     frames = len(gaps.visible)
     seen, length = gaps.visible.cpu().numpy(), gaps.length.cpu().numpy()
     decoys, sizes = np.zeros_like(seen), np.zeros_like(length)
     first = gaps.inside & ~torch.nn.functional.pad(gaps.inside, (0, 0, 1, 0))[:-1]
     for start, point in first.nonzero().tolist():
-        size = int(length[start, point])
+        size, made = int(length[start, point]), 0
+        room = params.tested * int(seen[:, point].sum())
         for shift in [s for k in range(size + 3, frames) for s in (-k, k)]:
             low, high = start + shift, start + shift + size
             if low < 2 or high > frames - 2 or not seen[low - 2 : high + 2, point].all():
                 continue
+            # one is always made; a point keeps most of what was seen of it
+            if made and (made == params.decoys or int(decoys[:, point].sum()) + size > room):
+                break
             if not decoys[low - 2 : high + 2, point].any():
                 decoys[low:high, point], sizes[low:high, point] = True, size
-            break
+                made += 1
     return torch.from_numpy(decoys).to(gaps.visible.device), torch.from_numpy(sizes).to(gaps.visible.device)
 
 
