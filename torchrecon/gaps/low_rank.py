@@ -41,7 +41,7 @@ class LowRankParams:
     disagree: float = 5.0
     bases: int = 4
     decoys: int = 12
-    tested: float = 0.3
+    tested: float = 0.1
 
 
 # gaps are judged together with gaps of similar length, frames
