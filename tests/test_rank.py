@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
-import scipy.integrate
 import torch
 
+from eval.reliability.ranks import mass_above
 from eval.reliability.world import low_rank_tracks
 from torchrecon.errors import ReconError
 from torchrecon.linalg.noise_edge import complement_basis, count_signals, spectrum, tracy_widom_edge
@@ -73,15 +72,6 @@ def test_eq25_26_whitened_eigenvalues_do_not_depend_on_how_the_points_are_scaled
     torch.testing.assert_close(estimate.eigenvalues, values.real.sort(descending=True).values)
 
 
-def _mass_above(level: float, ratio: float) -> float:
-    low, high = (1 - ratio**0.5) ** 2, (1 + ratio**0.5) ** 2
-
-    def density(x: float) -> float:
-        return math.sqrt(max((high - x) * (x - low), 0.0)) / (2 * math.pi * ratio * x)
-
-    return float(scipy.integrate.quad(density, level, high)[0])
-
-
 @pytest.mark.parametrize(("frames", "points", "bases"), [(1000, 60, 2), (300, 30, 3), (1000, 100, 1), (300, 60, 2)])
 def test_eq27_paper_rule_follows_its_closed_form(frames: int, points: int, bases: int) -> None:
     counts = []
@@ -95,9 +85,9 @@ def test_eq27_paper_rule_follows_its_closed_form(frames: int, points: int, bases
     measured = sum(counts) / len(counts)
     free, left = 2 * points - 2 - 6 * bases, frames - 6 * bases
     # the signals take 6K samples with them, but the paper divides by all F: the level 1 lies F / (F - 6K) higher
-    assert measured == pytest.approx(6 * bases + free * _mass_above(frames / left, free / left), rel=0.03)
+    assert measured == pytest.approx(6 * bases + free * mass_above(frames / left, free / left), rel=0.03)
     if frames == 1000:
-        plain = 6 * bases + free * _mass_above(1.0, (2 * points - 2) / frames)
+        plain = 6 * bases + free * mass_above(1.0, (2 * points - 2) / frames)
         assert measured == pytest.approx(plain, rel=0.03)
     assert measured > 1.5 * 6 * bases
 

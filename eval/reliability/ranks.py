@@ -15,7 +15,7 @@ from eval.job import run_parallel
 from eval.reliability.world import low_rank_tracks
 from torchrecon.rank import estimate_rank
 
-__all__ = ["CLOSED_FORM", "Cell", "draw_ranks", "grid", "measure_ranks"]
+__all__ = ["CLOSED_FORM", "Cell", "draw_ranks", "grid", "mass_above", "measure_ranks"]
 
 CLOSED_FORM = ("kritchman_nadler", "tracy_widom", "mp", "gavish_donoho", "mdl")
 _SNRS = (30.0, 20.0, 10.0, 0.0)
@@ -153,8 +153,13 @@ def _bias(records: Sequence[Mapping[str, Any]]) -> float:
     return sum(r["rank"] - r["bases"] for r in records) / len(records) if records else math.nan
 
 
-def _mass_above(level: float, ratio: float) -> float:
-    """Share of the Marchenko-Pastur law of this ratio above a level."""
+def mass_above(level: float, ratio: float) -> float:
+    """Share of the Marchenko-Pastur law of this ratio (at most 1) above a level.
+
+    Example:
+        >>> round(mass_above(1.0, 58 / 100), 2)
+        0.42
+    """
     low, high = (1 - ratio**0.5) ** 2, (1 + ratio**0.5) ** 2
 
     def density(x: float) -> float:
@@ -258,10 +263,10 @@ def _paper_lines(records: list[dict[str, Any]]) -> list[str]:
     for f, p, k in cells:
         rows = [6 * r["degree"] for r in records if (r["frames"], r["points"], r["bases"]) == (f, p, k)]
         measured = sum(rows) / len(rows)
-        plain = 6 * k + (2 * p - 2 - 6 * k) * _mass_above(1.0, (2 * p - 2) / f)
+        plain = 6 * k + (2 * p - 2 - 6 * k) * mass_above(1.0, (2 * p - 2) / f)
         # 6K samples went with the signals while the paper divides by all F
         free, left = 2 * p - 2 - 6 * k, f - 6 * k
-        exact = 6 * k + free * _mass_above(f / left, free / left)
+        exact = 6 * k + free * mass_above(f / left, free / left)
         off = 100 * (measured / plain - 1)
         lines.append(
             f"  F = {f}, P = {p}, K = {k}: measured {measured:.1f}, closed form {plain:.1f} ({off:+.1f} %), "
