@@ -12,9 +12,10 @@ import yaml
 
 from eval.job import ROOT
 from eval.reliability.__main__ import main, read_config
-from eval.reliability.motions import synthetic_joints
+from eval.reliability.motions import humaneva_joints, synthetic_joints
 from eval.reliability.ranks import grid
 from eval.reliability.world import low_rank_tracks
+from torchrecon.errors import ReconError
 
 CONFIG = ROOT / "configs" / "reliability.yaml"
 
@@ -92,3 +93,5 @@ def test_bad_input_is_named(tmp_path, capsys):
     assert "costly" in capsys.readouterr().err
     assert main(["--only", "filling", "--smoke", "--data", str(tmp_path), "-o", str(tmp_path / "o")]) == 2
     assert "dev.npz" in capsys.readouterr().err
+    with pytest.raises(ReconError, match="no such file"):
+        humaneva_joints(tmp_path / "humaneva15_train.npz")

@@ -12,6 +12,7 @@ import torch
 from torchrecon._typing import Float, Tensor
 from torchrecon.data.mocap import load_mocap
 from torchrecon.data.synthetic import ACTIONS, sample_body, sample_motion
+from torchrecon.errors import ReconError
 
 __all__ = ["Joints2D", "humaneva_joints", "mocap_joints", "synthetic_joints"]
 
@@ -84,7 +85,13 @@ def mocap_joints(path: Path, count: int | None = None, least: int = 80) -> list[
 
 
 def humaneva_joints(path: Path, count: int | None = None) -> list[Joints2D]:
-    """Real cameras on real people: each sequence in each of its cameras, every second frame (30 Hz), evenly taken."""
+    """Real cameras on real people: each sequence in each of its cameras, every second frame (30 Hz), evenly taken.
+
+    Raises:
+        ReconError: no such file.
+    """
+    if not path.is_file():
+        raise ReconError(f"{path}: there is no such file; --data needs mocap/ and keypoints/ in it")
     with np.load(path, allow_pickle=False) as archive:
         made = [
             Joints2D(f"{name[:-4]} camera {c}", name, torch.from_numpy(archive[name][c, ::2]).double(), 30.0)

@@ -282,9 +282,14 @@ def draw_ranks(records: Sequence[Mapping[str, Any]], ax: Any) -> None:
         shares = [
             _share([r for r in of_grid if (r["rule"], r["layout"], r["snr"]) == (rule, layout, snr)]) for snr in _SNRS
         ]
-        ax.plot(_SNRS, shares, ":" if layout == "vector" else "-", marker="o", label=f"{rule} {layout}")
+        if rule == "auto":
+            ax.plot(_SNRS, shares, "k-", linewidth=4, alpha=0.35, label="auto")
+            continue
+        colour = "k" if rule == "paper" else f"C{CLOSED_FORM.index(rule)}"
+        style = ":" if layout == "vector" else "-"
+        ax.plot(_SNRS, shares, style, color=colour, marker="o", label=f"{rule} {layout}")
     ax.set(xlabel="SNR, dB", ylabel="K exact, % of all cells that fit", ylim=(0, 101))
-    ax.legend(fontsize=7)
+    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def measure_ranks(config: Mapping[str, Any], full: bool, workers: int) -> tuple[dict[str, Any], list[str]]:

@@ -61,8 +61,9 @@ class TrajectoryParams:
         static_turn: change of view below which depth is called undetermined (degrees): a fixed camera on a moving
             person fits turns of 25 to 45 degrees.
         evidence: what a turn has to gain over a fixed view for depth to be called determined (nats per observation).
-            Real clips of standing cameras gain up to 0.04, synthetic ones less than nothing or turn by less than
-            ``static_turn``; films that turn by 300 degrees gain 0.08 at least, those of jumps and runs least.
+            Two real clips of standing cameras gain 0.04, eight synthetic ones nothing or turn by less than
+            ``static_turn``; synthetic films that turn by 300 degrees gain 0.08 at least, those of jumps least. Of 131
+            such films of real motion about six gain less than the limit.
     """
 
     variances: tuple[float, ...] = (0.001, 0.01, 0.05, 0.3)

@@ -68,8 +68,8 @@ def estimate_rank(
     Args:
         tracks: any batch shape; items are treated one by one.
         rule: ``auto``; ``paper`` (eqs. 25-27 as printed: vector layout, given noise scale, needs covariance); ``mp``;
-            ``tracy_widom``; ``kritchman_nadler``; ``mdl``; ``gavish_donoho``; ``bootstrap`` (its interval covers K in
-            95 % of cases); ``cross_validation``.
+            ``tracy_widom``; ``kritchman_nadler``; ``mdl``; ``gavish_donoho``; ``bootstrap`` (with an interval of its
+            own); ``cross_validation``.
         layout: ``stack`` (2F x P, rank 3K under any motion) or ``vector`` (F x 2P, rank 6K only under rotation about
             three axes). Default: ``stack``, for ``paper`` ``vector``.
         noise_scale: ``estimate``: the covariance is right up to one factor; ``given``: it is right as it stands.
