@@ -14,7 +14,7 @@ import torch
 
 from torchrecon._typing import Float, Tensor
 
-__all__ = ["complement_basis", "count_signals", "kritchman_nadler_noise", "spectrum", "tracy_widom_edge"]
+__all__ = ["complement_basis", "count_signals", "kritchman_nadler_noise", "marchenko_pastur_tail", "spectrum", "tracy_widom_edge"]
 
 # quantiles of the Tracy-Widom distribution for real matrices
 TRACY_WIDOM = {0.5: -1.2686, 0.95: 0.9793, 0.995: 2.4224, 0.999: 3.2724}
@@ -124,3 +124,24 @@ def count_signals(
             thresholds.extend(thresholds[-1:] * (d - k - 1))
             break
     return count, eigenvalues.new_tensor(thresholds)
+
+
+def marchenko_pastur_tail(ratio: float, share: float) -> float:
+    """Mean of the smallest ``share`` of the eigenvalues of pure noise of variance 1 (Marchenko-Pastur law).
+
+    Args:
+        ratio: dimensions over samples, d / n, in (0, 1].
+        share: in (0, 1].
+
+    Example:
+        >>> round(marchenko_pastur_tail(0.5, 1.0), 2), round(marchenko_pastur_tail(0.5, 0.25), 2)
+        (1.0, 0.21)
+    """
+    low, high = (1 - ratio**0.5) ** 2, (1 + ratio**0.5) ** 2
+    # x = middle + half * sin(a): the square roots at both edges become smooth in a.
+    angle = torch.linspace(-math.pi / 2, math.pi / 2, 4001, dtype=torch.float64)
+    x = (low + high) / 2 + (high - low) / 2 * angle.sin()
+    density = ((high - low) / 2 * angle.cos()) ** 2 / x.clamp_min(1e-300)
+    mass = density.cumsum(0) / density.sum()
+    inside = mass <= max(share, float(mass[1]))
+    return float((density * x)[inside].sum() / density[inside].sum())

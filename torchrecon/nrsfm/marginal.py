@@ -1,0 +1,190 @@
+"""Low-rank shapes by marginal likelihood: poses, mean shape and loadings, everything else integrated out.
+
+Starts come from metric upgrades with several numbers of bases. From each, the residual of the model falls from coarse
+to fine; at every level one step of expectation-maximisation lets new modes in where the tracks ask for them, and a
+preconditioned quasi-Newton descent follows the likelihood. The likeliest start is carried through. No K is needed:
+the reported rank is the caller's. Complete and incomplete tracks, with or without covariance, one objective.
+The model is in ``shape_likelihood``; the search is derived here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+
+from torchrecon._typing import Float, Int, Tensor
+from torchrecon.linalg.noise_edge import marchenko_pastur_tail
+from torchrecon.linalg.missing_factors import fit_factors, grow_factors, start_factors
+from torchrecon.measurement import Reconstruction, Status, Tracks
+from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.observations import Observations, observe
+from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
+
+__all__ = ["MarginalParams", "marginal", "solve_marginal"]
+
+STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
+
+
+@dataclass(frozen=True)
+class MarginalParams:
+    """Parameters of the solver; lengths are in units of the rms size of the tracks.
+
+    Attributes:
+        upgrade: of the metric upgrade, which supplies the starts.
+        descent: of the quasi-Newton descent.
+        coarse, fine: first and last standard deviation of the residual.
+        finest: how far below ``fine`` the residual goes on falling while no new mode appears.
+        levels: number of residual levels, geometric from coarse to fine (count).
+        trial_levels: levels after which the likeliest start is kept (count).
+        starts: starts that are tried, lowest residual of the upgrade first (count).
+        steps: quasi-Newton steps per level (count); last_steps: on the last level.
+        growths: steps of expectation-maximisation before each level (count).
+        modes: deformation modes at most (count).
+        fill_rank: rank of the completion from which incomplete tracks take their starts.
+        noise_share: share of the spectrum from whose small end the noise is read where no covariance is given.
+    """
+
+    upgrade: UpgradeParams = field(default_factory=UpgradeParams)
+    descent: DescentParams = field(default_factory=DescentParams)
+    coarse: float = 0.1
+    fine: float = 0.003
+    finest: float = 0.0001
+    levels: int = 8
+    trial_levels: int = 2
+    starts: int = 3
+    steps: int = 15
+    last_steps: int = 100
+    growths: int = 2
+    modes: int = 40
+    fill_rank: int = 9
+    noise_share: float = 0.25
+
+
+def _noise_variance(stack: Float[Tensor, "rows points"], share: float) -> float:
+    """Noise variance of the entries, read off the smallest ``share`` of the eigenvalues by the Marchenko-Pastur law.
+
+    Small deformations of a noise-free body fill the middle of the spectrum, so its end is read and no rank is needed.
+    """
+    n, d = max(stack.shape), min(stack.shape[0], stack.shape[1] - 1)
+    eigenvalues = torch.linalg.svdvals(stack)[:d].square() / n
+    count = max(1, int(share * d))
+    return float(eigenvalues[-count:].mean()) / marchenko_pastur_tail(d / n, share)
+
+
+def _filled(data: Observations, rank: int) -> Tensor:
+    """Every entry with a value for the starts: low-rank completion where entries are missing; never a measurement."""
+    if bool(data.visible.all()):
+        return data.xy
+    model = start_factors(data.xy, data.visible)
+    for _ in range(rank // 3):
+        model = fit_factors(grow_factors(model, data.xy, data.visible, 3), data.xy, data.visible)
+    return torch.where(data.visible[..., None], data.xy, model.predict())
+
+
+def _views(data: Observations, stack: Tensor, share: float) -> Views:
+    """Observations with their covariance, or one common variance read off the end of the spectrum."""
+    eye = torch.eye(2, dtype=data.xy.dtype, device=data.xy.device)
+    if data.noise_known:
+        information = data.weight.mT @ data.weight
+        noise = torch.linalg.inv(torch.where(data.visible[..., None, None], information, eye))
+    else:
+        noise = _noise_variance(stack, share) * eye.expand(*data.xy.shape, 2)
+    return Views(data.xy, data.visible, noise)
+
+
+def _rigid_model(xy: Tensor, rotations: Tensor) -> ShapeModel:
+    """The rigid shape that fits filled views best, one per candidate (candidates, frames, 3, 3)."""
+    rows = rotations[:, :, :2].flatten(1, 2)
+    stack = (xy - xy.mean(1, keepdim=True)).mT.flatten(0, 1)
+    mean = (torch.linalg.pinv(rows.mT @ rows) @ (rows.mT @ stack)).mT
+    return ShapeModel(rotations, torch.ones_like(rotations[..., 0, 0]), mean, mean.new_zeros(*mean.shape, 0), torch.linalg.qr(tangents(mean))[0])
+
+
+def solve_marginal(
+    item: Tracks, rank: int, generator: torch.Generator, params: MarginalParams | None = None
+) -> Reconstruction:
+    """Solve one sequence; computed in float64, returned in the type of the tracks."""
+    params = params or MarginalParams()
+    dtype = item.xy.dtype
+    with torch.no_grad():
+        data = observe(item.to(dtype=torch.float64))
+        filled = _filled(data, params.fill_rank)
+        centred = filled - filled.mean(1, keepdim=True)
+        stack = centred.mT.flatten(0, 1)
+        found = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
+        rotations = torch.stack([start[2] for start in found[: params.starts]])
+        model = _rigid_model(filled, rotations)
+        views = _views(data, stack, params.noise_share)
+        fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
+        eps, level, before = params.coarse, 0, -1
+        while True:
+            whitener = views.whitener(eps).expand(len(model.scale), *views.noise.shape)
+            for _ in range(params.growths):
+                model = grow_loadings(views, whitener, model, eps, params.modes)
+            steps = params.last_steps if level == params.levels - 1 else params.steps
+            model, value, converged = descend(views, whitener, model, eps, steps, params.descent)
+            if level == params.trial_levels - 1:
+                model = model.pick(int(value.argmin()))
+            # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly.
+            modes = model.loadings.shape[-1]
+            if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
+                break
+            eps, level, before = eps * fall, level + 1, modes
+        answer = evaluate(views, views.whitener(eps)[None], model, eps)
+    return _reconstruction(data, model, answer, eps, rank, bool(converged), len(rotations), params).to(dtype=dtype)
+
+
+def _reconstruction(data, model, answer, eps, rank, converged, tried, params):  # type: ignore[no-untyped-def]
+    points3d, rotations, scale = answer.points[0], model.rotations[0], model.scale[0]
+    covariance = answer.spread[0] @ answer.spread[0].mT
+    plane = torch.diag_embed(torch.ones_like(points3d)) * eps**2
+    scale = torch.ones_like(scale)
+    flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
+    flip[2] = mirror_sign(points3d - points3d.mean(-2, keepdim=True))
+    both = flip[:, None] * flip
+    turn = float(turn_of_view(rotations))
+    status = check_size(data.tracks, rank)
+    static = turn < STATIC_TURN or (bool(data.visible.all()) and looks_static(data.xy - data.xy.mean(1, keepdim=True)))
+    if status is None and static:
+        status = Status(
+            "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
+        )
+    if status is None and not converged:
+        status = Status("not_converged", "the likelihood still rose when the steps were spent")
+    if status is None:
+        status = Status("ok", f"likeliest of {tried} starts, view turning by {turn:.0f} degrees")
+    return data.reconstruction(
+        points3d * flip,
+        rotations * both,
+        scale,
+        answer.translation[0],
+        rank=rank,
+        status=status,
+        covariance3d=(covariance + plane) * both,
+    )
+
+
+def marginal(
+    tracks: Tracks, rank: int | Int[Tensor, "*batch"], *, generator: torch.Generator | None = None
+) -> Reconstruction:
+    """Marginal likelihood of low-rank shapes under scaled orthographic views; any leading batch.
+
+    Args:
+        tracks: seen entries only are read; a covariance is used where there is one.
+        rank: what the result reports; without a covariance it also tells signal from noise in the start.
+        generator: starts of the metric upgrade.
+
+    Example:
+        >>> import torch
+        >>> from torchrecon.linalg import rotation_from_vector
+        >>> g = torch.Generator().manual_seed(0)
+        >>> shape = torch.randn(12, 3, generator=g)
+        >>> turn = rotation_from_vector(torch.linspace(0, 3, 15)[:, None] * torch.tensor([0.3, 1.0, 0.1]))
+        >>> marginal(Tracks((shape @ turn.mT)[..., :2]), 1).points3d.shape
+        torch.Size([15, 12, 3])
+    """
+    return solve_items(tracks, rank, solve_marginal, generator)

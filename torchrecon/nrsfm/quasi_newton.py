@@ -1,0 +1,144 @@
+"""Preconditioned limited-memory quasi-Newton descent of the marginal likelihood, all batch items at once.
+
+The initial metric is the information of the model: a 4 x 4 block per pose, the covariance of the shapes for mean and
+loadings. It is fresh in every step, which is what lets few steps walk the valley that couples tilt with depth. Steps,
+curvature pairs and the line search are per item; an item never waits for the line search of another to say no.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from torchrecon._typing import Tensor
+from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, moved
+
+__all__ = ["DescentParams", "descend"]
+
+
+@dataclass(frozen=True)
+class DescentParams:
+    """Parameters of the descent.
+
+    Attributes:
+        memory: curvature pairs that are kept (count).
+        tolerance: fall of the value per frame and step at which an item has converged (nats).
+        turn: largest turn of a frame in one step (radians).
+        halvings: line search trials per step (count).
+        sufficient: share of the predicted fall that a step has to bring (no unit).
+    """
+
+    memory: int = 20
+    tolerance: float = 1e-3
+    turn: float = 0.4
+    halvings: int = 8
+    sufficient: float = 1e-4
+
+
+Direction = tuple[Tensor, Tensor, Tensor]
+
+
+def _dot(a: Direction, b: Direction) -> Tensor:
+    """Inner product per item (b,)."""
+    return sum(((x * y).flatten(1).sum(1) for x, y in zip(a, b, strict=True)), torch.zeros_like(a[0][:, 0, 0]))
+
+
+def _add(a: Direction, factor: Tensor, b: Direction) -> Direction:
+    wide = [factor.view(-1, *[1] * (x.ndim - 1)) for x in a]
+    return tuple(x + w * y for x, w, y in zip(a, wide, b, strict=True))  # type: ignore[return-value]
+
+
+def _choose(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    return torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b)
+
+
+def _gradient(at: Evaluation) -> Direction:
+    return at.pose, at.mean, at.loadings
+
+
+def _metric(model: ShapeModel, fisher: Tensor, residual: Tensor):  # type: ignore[no-untyped-def]
+    """The inverse information of poses, mean and loadings, as a function on gradients."""
+    frames, modes = model.scale.shape[-1], model.loadings.shape[-1]
+    eye = torch.eye(4, dtype=fisher.dtype, device=fisher.device)
+    # A pose that the frame does not determine keeps its place.
+    size = fisher.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+    factor = torch.linalg.cholesky(fisher + (1e-6 * size + torch.finfo(size.dtype).tiny) * eye)
+    flat = model.loadings.flatten(-3, -2)
+
+    def spread(gradient: Tensor) -> Tensor:
+        return flat @ (flat.mT @ gradient) + residual[:, None, None] * gradient
+
+    def apply(gradient: Direction) -> Direction:
+        pose, mean, loadings = gradient
+        return (
+            torch.cholesky_solve(pose[..., None], factor)[..., 0],
+            spread(mean.flatten(-2)[..., None]).view_as(mean) / frames,
+            (spread(loadings.flatten(-3, -2)) / (2 * frames)).view_as(loadings) if modes else loadings,
+        )
+
+    return apply
+
+
+def descend(
+    views: Views, whitener: Tensor, model: ShapeModel, eps: float, steps: int, params: DescentParams
+) -> tuple[ShapeModel, Tensor, bool]:
+    """At most ``steps`` steps from a model with one leading batch dimension.
+
+    Returns:
+        model; the value per item (b,); whether every item converged before the steps were spent.
+    """
+    frames = model.scale.shape[-1]
+    noise = views.noise.diagonal(dim1=-2, dim2=-1).mean() + eps**2
+    residual = noise.expand(len(model.scale))
+    now = evaluate(views, whitener, model, eps)
+    pairs: list[tuple[Direction, Direction, Tensor]] = []
+    done = torch.zeros_like(now.value, dtype=torch.bool)
+    for _ in range(steps):
+        metric = _metric(model, now.pose_fisher, residual)
+        q, kept = _gradient(now), []
+        for step, change, weight in reversed(pairs):
+            share = weight * _dot(step, q)
+            q = _add(q, -share, change)
+            kept.append(share)
+        q = metric(q)
+        for (step, change, weight), share in zip(pairs, reversed(kept), strict=True):
+            q = _add(q, share - weight * _dot(change, q), step)
+        slope = -_dot(q, _gradient(now))
+        # A direction that does not descend starts the memory of its item anew.
+        lost = slope >= 0
+        if bool(lost.any()):
+            plain = metric(_gradient(now))
+            q = tuple(_choose(lost, a, b) for a, b in zip(plain, q, strict=True))  # type: ignore[assignment]
+            slope = -_dot(q, _gradient(now))
+            pairs = [(s, c, torch.where(lost, torch.zeros_like(w), w)) for s, c, w in pairs]
+        turn = q[0][..., :3].norm(dim=-1).amax(-1)
+        length = torch.where(done, torch.zeros_like(turn), (params.turn / turn.clamp_min(1e-300)).clamp_max(1.0))
+        for _ in range(params.halvings):
+            step = _add(tuple(torch.zeros_like(x) for x in q), -length, q)  # type: ignore[arg-type]
+            trial = moved(model, *step)
+            then = evaluate(views, whitener, trial, eps)
+            good = (then.value <= now.value + params.sufficient * length * slope) | (length == 0)
+            if bool(good.all()):
+                break
+            length = torch.where(good, length, 0.4 * length)
+        length = torch.where(good, length, torch.zeros_like(length))
+        if not bool(good.all()):
+            step = _add(tuple(torch.zeros_like(x) for x in q), -length, q)  # type: ignore[arg-type]
+            trial = moved(model, *step)
+            then = evaluate(views, whitener, trial, eps)
+        change = _add(_gradient(then), -torch.ones_like(length), _gradient(now))
+        curvature = _dot(step, change)
+        usable = curvature > 1e-10 * (length * slope).abs()
+        weight = torch.where(usable, 1 / curvature.where(usable, torch.ones_like(curvature)), torch.zeros_like(turn))
+        pairs = [*pairs, (step, change, weight)][-params.memory :]
+        fell = now.value - then.value
+        model, now = trial, then
+        # Where the line search failed, the memory is to blame unless there was none.
+        fresh = sum((w for _, _, w in pairs[:-1]), torch.zeros_like(turn)) == 0
+        failed = (length == 0) & ~done
+        pairs = [(s, c, torch.where(failed, torch.zeros_like(w), w)) for s, c, w in pairs]
+        done = done | ((fell < params.tolerance * frames) & (~failed | fresh))
+        if bool(done.all()):
+            break
+    return model, now.value, bool(done.all())

@@ -1,0 +1,215 @@
+"""How likely tracks are when every frame shows a draw from one low-dimensional family of shapes.
+
+Frame f shows ``s_f R_f (m + sum_k L_k a_fk + residual) + t_f`` through its first two rows, with weights
+``a_f ~ N(0, I)``, an isotropic 3D residual of variance ``eps^2`` and the noise covariance of each observation. Weights,
+residual and translation (flat prior) are integrated out in closed form, so depths are never estimated on the way and
+unseen entries are never filled: what is left are the poses (s_f, R_f), the mean shape m and the loadings L. The
+loadings are kept orthogonal to what a turn or a change of size would do to the mean shape: the Procrustean condition of
+Lee et al. (CVPR 2013), without which turns and deformations are confounded.
+Derived here from that model; its one published relative, estimated by expectation-maximisation with a residual in the
+image, is Torresani et al. (PAMI 2008).
+Cost: linear in frames and in points. All leading dimensions are batch dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+
+from torchrecon._typing import Bool, Float, Tensor
+from torchrecon.linalg import rotation_from_vector, skew
+
+__all__ = ["Evaluation", "ShapeModel", "Views", "evaluate", "grow_loadings", "moved", "tangents"]
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Observations in units in which the body has rms size about one.
+
+    Attributes:
+        xy: (*b, frames, points, 2), any finite value where nothing is seen.
+        visible: (*b, frames, points).
+        noise: (*b, frames, points, 2, 2) covariance of the observations, squared units; zero for exact ones.
+    """
+
+    xy: Float[Tensor, "*b frames points 2"]
+    visible: Bool[Tensor, "*b frames points"]
+    noise: Float[Tensor, "*b frames points 2 2"]
+
+    def whitener(self, eps: float) -> Float[Tensor, "*b frames points 2 2"]:
+        """K with ``K^T K`` the inverse of noise plus residual; zero where nothing is seen."""
+        eye = torch.eye(2, dtype=self.xy.dtype, device=self.xy.device)
+        factor = torch.linalg.cholesky(self.noise + eps**2 * eye)
+        inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+        return inverse * self.visible[..., None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeModel:
+    """Poses and family of shapes; gradients and steps keep the loadings orthogonal to ``avoided``.
+
+    Attributes:
+        rotations: (*b, frames, 3, 3) canonical -> camera.
+        scale: (*b, frames), geometric mean one.
+        mean: (*b, points, 3) centred.
+        loadings: (*b, points, 3, modes).
+        avoided: (*b, 3 * points, 4) orthonormal; spans what turn and growth do to the mean shape at its last growth.
+    """
+
+    rotations: Float[Tensor, "*b frames 3 3"]
+    scale: Float[Tensor, "*b frames"]
+    mean: Float[Tensor, "*b points 3"]
+    loadings: Float[Tensor, "*b points 3 modes"]
+    avoided: Float[Tensor, "*b size 4"]
+
+    def pick(self, index: int) -> ShapeModel:
+        """Item ``index`` of the first dimension, as a batch of one."""
+        return ShapeModel(*(getattr(self, part.name)[index : index + 1] for part in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Value, gradient and curvature at a model, and the posterior of the shapes.
+
+    Attributes:
+        value: (*b) minus the log-likelihood, summed over frames.
+        pose: (*b, frames, 4) gradient: rotation vector on the camera side, logarithm of the scale.
+        mean, loadings: gradients.
+        pose_fisher: (*b, frames, 4, 4) expected information of the poses.
+        points: (*b, frames, points, 3) posterior mean in camera axes, the scale included, translation removed.
+        spread: (*b, frames, points, 3, columns) ``points`` moves by ``spread @ d`` with d ~ N(0, I): uncertainty of the
+            weights; the residual comes on top.
+        translation: (*b, frames, 2).
+    """
+
+    value: Float[Tensor, "*b"]
+    pose: Float[Tensor, "*b frames 4"]
+    mean: Float[Tensor, "*b points 3"]
+    loadings: Float[Tensor, "*b points 3 modes"]
+    pose_fisher: Float[Tensor, "*b frames 4 4"]
+    points: Float[Tensor, "*b frames points 3"]
+    spread: Float[Tensor, "*b frames points 3 columns"]
+    translation: Float[Tensor, "*b frames 2"]
+
+
+def tangents(mean: Float[Tensor, "*b points 3"]) -> Float[Tensor, "*b size 4"]:
+    """What three turns and a growth do to the mean shape, as columns of 3 * points numbers."""
+    eye = torch.eye(3, dtype=mean.dtype, device=mean.device)
+    turned = torch.linalg.cross(eye.expand(*mean.shape[:-1], 3, 3), mean[..., None, :].expand(*mean.shape[:-1], 3, 3))
+    return torch.cat([turned.mT, mean[..., None]], -1).flatten(-3, -2)
+
+
+def moved(model: ShapeModel, pose: Tensor, mean: Tensor, loadings: Tensor) -> ShapeModel:
+    """The model after a step: poses on their manifold, loadings back on theirs."""
+    growth = pose[..., 3] - pose[..., 3].mean(-1, keepdim=True)
+    return replace(
+        model,
+        rotations=rotation_from_vector(pose[..., :3]) @ model.rotations,
+        scale=model.scale * torch.exp(growth),
+        mean=model.mean + mean,
+        loadings=model.loadings + loadings,
+    )
+
+
+def _placed(model: ShapeModel) -> Tensor:
+    """Mean and loadings of every frame in camera axes: (*b, frames, 3, points, 1 + modes)."""
+    basis = torch.cat([model.mean[..., None], model.loadings], -1)
+    flat = basis.transpose(-3, -2).flatten(-2)
+    poses = (model.scale[..., None, None] * model.rotations).flatten(-3, -2)
+    return (poses @ flat).unflatten(-2, (model.scale.shape[-1], 3)).unflatten(-1, (basis.shape[-3], basis.shape[-1]))
+
+
+def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float) -> Evaluation:
+    """Minus the log-likelihood with its gradient, see the module's text; ``whitener`` is that of ``views`` at eps."""
+    modes = model.loadings.shape[-1]
+    placed = _placed(model)
+    plane = placed[..., :2, :, :].transpose(-3, -2)  # (*b, frames, points, 2, 1 + modes)
+    seen = views.visible[..., None]
+    error = torch.where(seen, views.xy - plane[..., 0], plane.new_zeros(()))
+    # Columns: the modes, then the two of the translation, whose prior is flat.
+    design = torch.cat([whitener @ plane[..., 1:], whitener], -1).flatten(-3, -2)
+    target = (whitener @ error[..., None]).flatten(-3, -2)
+    precision = torch.cat([plane.new_ones(modes), plane.new_full((2,), 1e-9)])
+    factor = torch.linalg.cholesky(design.mT @ design + torch.diag(precision))
+    weights = torch.cholesky_solve(design.mT @ target, factor)
+    rest = target - design @ weights
+    half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    scatter = torch.where(seen, whitener.diagonal(dim1=-2, dim2=-1), plane.new_ones(())).log().sum((-1, -2))
+    value = (0.5 * (target * rest).sum((-1, -2)) + half - scatter).sum(-1)
+
+    # Gradient with respect to everything placed in the image.
+    solved = torch.cholesky_solve(design.mT, factor).mT[..., :modes]
+    inner = torch.cat([-rest, solved - rest @ weights[..., :modes, :].mT], -1)
+    slope = whitener.mT @ inner.unflatten(-2, (plane.shape[-3], 2))
+    stacked = slope.transpose(-3, -2).flatten(-2)  # (*b, frames, 2, points * (1 + modes))
+    poses = model.scale[..., None, None] * model.rotations[..., :2, :]
+    basis = (poses.flatten(-3, -2).mT @ stacked.flatten(-3, -2)).unflatten(-1, (plane.shape[-3], 1 + modes))
+    basis = basis.transpose(-3, -2)
+    x, y, z = placed.flatten(-2).unbind(-2)
+    gx, gy = stacked.unbind(-2)
+    pose = torch.stack(
+        [-(gy * z).sum(-1), (gx * z).sum(-1), (gy * x - gx * y).sum(-1), (gx * x + gy * y).sum(-1)], -1
+    )
+    pose[..., 3] -= pose[..., 3].mean(-1, keepdim=True)
+    mean, loadings = basis[..., 0], basis[..., 1:]
+    flat = loadings.flatten(-3, -2)
+    loadings = (flat - model.avoided @ (model.avoided.mT @ flat)).view_as(loadings)
+
+    # Posterior of the shapes, and the information of the poses at its mean.
+    average = torch.cat([torch.ones_like(weights[..., :1, 0]), weights[..., :modes, 0]], -1)
+    fitted = torch.einsum("...cpk,...k->...pc", placed, average)
+    translation = weights[..., modes:, 0]
+    gain = eps**2 * whitener.mT @ whitener
+    loose = error - (fitted[..., :2] - plane[..., 0]) - translation[..., None, :]
+    inplane = fitted[..., :2] + (gain @ torch.where(seen, loose, loose.new_zeros(()))[..., None])[..., 0]
+    points = torch.cat([inplane, fitted[..., 2:]], -1)
+    keep = torch.eye(2, dtype=mean.dtype, device=mean.device) - gain
+    # G^-1 = U U^T with U the inverse transpose of the Cholesky factor.
+    eye = torch.eye(modes + 2, dtype=mean.dtype, device=mean.device)
+    root = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False).mT[..., :modes, :]
+    loading3 = placed[..., 1:].transpose(-3, -2)  # (*b, frames, points, 3, modes)
+    kept = torch.cat([keep @ loading3[..., :2, :], loading3[..., 2:, :]], -2)
+    spread = (kept.flatten(-3, -2) @ root).unflatten(-2, kept.shape[-3:-1])
+    jacobian = torch.cat([-skew(points)[..., :2, :], points[..., :2, None]], -1)
+    seen_jacobian = (whitener @ jacobian).flatten(-3, -2)
+    explained = torch.linalg.solve_triangular(factor, design.mT @ seen_jacobian, upper=False)
+    fisher = seen_jacobian.mT @ seen_jacobian - explained.mT @ explained
+    return Evaluation(
+        value, pose, mean - mean.mean(-2, keepdim=True), loadings, fisher, points, spread, translation
+    )
+
+
+def grow_loadings(
+    views: Views, whitener: Tensor, model: ShapeModel, eps: float, most: int
+) -> ShapeModel:
+    """One step of expectation-maximisation for mean and loadings: principal directions of the expected covariance.
+
+    Directions whose variance exceeds that of the residual become modes, at most ``most``: the number of modes finds
+    itself. Loadings of fewer modes are padded with zeros to the largest of the batch.
+    """
+    now = evaluate(views, whitener, model, eps)
+    back = model.rotations / model.scale[..., None, None]
+    shapes = now.points @ back
+    mean = shapes.mean(-3)
+    mean = mean - mean.mean(-2, keepdim=True)
+    frames = shapes.shape[-3]
+    data = (shapes - shapes.mean(-3, keepdim=True)).flatten(-2)
+    doubt = back[..., None, :, :].mT @ now.spread  # canonical axes
+    doubt = doubt.flatten(-3, -2).mT.flatten(-3, -2)  # (*b, frames * columns, 3 * points)
+    rows = torch.cat([data, doubt], -2) / frames**0.5
+    avoided, _ = torch.linalg.qr(tangents(mean))
+    rows = rows - (rows @ avoided) @ avoided.mT
+    gain = (eps**2 * (whitener * whitener).sum((-1, -2))).mean((-1, -2))  # 2 for exact, 0 for unseen entries
+    residual = eps**2 * (1 - gain / 3)
+    if rows.shape[-2] <= rows.shape[-1]:
+        values, left = torch.linalg.eigh(rows @ rows.mT)
+        vectors = rows.mT @ (left / values.clamp_min(torch.finfo(values.dtype).tiny).sqrt()[..., None, :])
+    else:
+        values, vectors = torch.linalg.eigh(rows.mT @ rows)
+    values = values.flip(-1)[..., :most]
+    vectors = vectors.flip(-1)[..., :most]
+    strength = (values + residual[..., None] - eps**2).clamp_min(0)
+    modes = int((strength > 0).sum(-1).max())
+    loadings = vectors[..., :modes] * strength[..., None, :modes].sqrt()
+    return ShapeModel(model.rotations, model.scale, mean, loadings.unflatten(-2, (mean.shape[-2], 3)), avoided)
