@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -90,10 +91,28 @@ def reconstruct(options: argparse.Namespace) -> None:
 
 def export(options: argparse.Namespace) -> None:
     """``torchrecon export``."""
-    from torchrecon.io.export import export_reconstruction
+    from torchrecon.io.export import export_reconstruction, to_motion
+    from torchrecon.io.tracks import load_tracks
 
-    path = export_reconstruction(Reconstruction.load(options.reconstruction), options.out, options.fps)
-    _say(options, {"out": str(path)})
+    source, out = Path(options.reconstruction), Path(options.out)
+    reconstruction, tracks_file = Reconstruction.load(source), _tracks_of(options, source)
+    tracks = None if tracks_file is None else load_tracks(tracks_file)
+    if out.exists() and out.samefile(source):
+        raise ReconError(f"{out}: is the reconstruction itself; choose another name")
+    scales = {"unit_scale": options.unit_scale, "height_m": options.height}
+    unit = to_motion(reconstruction, options.fps, tracks, **scales).unit
+    path = export_reconstruction(
+        reconstruction, options.out, options.fps, tracks=tracks, **scales, video=options.video, force=options.force
+    )
+    _say(options, {"out": str(path), "unit": unit, "tracks": None if tracks_file is None else str(tracks_file)})
+
+
+def _tracks_of(options: argparse.Namespace, reconstruction: Path) -> Path | None:
+    """The tracks that were named, else those of the run whose folder holds the reconstruction."""
+    if options.tracks is not None:
+        return Path(options.tracks)
+    beside = reconstruction.with_name("tracks.npz")
+    return beside if beside.is_file() and reconstruction.with_name("run.json").is_file() else None
 
 
 def _config(options: argparse.Namespace) -> Any:

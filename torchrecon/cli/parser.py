@@ -52,8 +52,14 @@ def build_parser() -> argparse.ArgumentParser:
 
     export = _command(commands, "export", "reconstruction to other programs' formats, chosen by the suffix")
     export.add_argument("reconstruction", metavar="RECON.npz")
-    export.add_argument("-o", "--out", required=True, metavar="FILE.{csv,ply,trc,c3d}")
-    export.add_argument("--fps", type=float, default=25.0, help="frames per second of the clip (default: 25)")
+    export.add_argument("-o", "--out", required=True, metavar="FILE.{bvh,c3d,csv,glb,mp4,npz,ply,rrd,trc}")
+    export.add_argument("--tracks", metavar="TRACKS", help="rate, names, bones (default: those of RECON's own run)")
+    export.add_argument("--fps", type=float, help="frames per second (default: that of the tracks, else 25)")
+    scale = export.add_mutually_exclusive_group()
+    scale.add_argument("--height", type=float, metavar="M", help="stature of the person: scales the result to metres")
+    scale.add_argument("--unit-scale", type=float, metavar="X", help="metres per unit of the reconstruction")
+    export.add_argument("--video", metavar="VIDEO", help="the clip, for .mp4")
+    export.add_argument("--force", action="store_true", help="replace an earlier sequence of .ply files")
     return parser
 
 
