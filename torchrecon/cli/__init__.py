@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 
 from torchrecon.cli.parser import build_parser
@@ -17,10 +18,10 @@ def main(arguments: list[str] | None = None) -> int:
         0 when done, 2 for unusable input (one sentence on stderr), 130 when interrupted.
     """
     options = build_parser().parse_args(arguments)
-    from torchrecon.cli import commands
-
+    # The first two have to work where torch does not.
+    module = options.command if options.command in ("doctor", "completion") else "commands"
     try:
-        commands.run(options)
+        importlib.import_module(f"torchrecon.cli.{module}").run(options)
     except ReconError as error:
         print(f"torchrecon {options.command}: {error}", file=sys.stderr)
         return 2
