@@ -23,9 +23,8 @@ def run(options: argparse.Namespace) -> None:
         torch.empty(0, device=options.device)
     except (RuntimeError, AssertionError) as error:  # a build without that backend fails an assertion inside torch
         raise ReconError(f"--device {options.device}: is not available here ({error})") from error
-    {"solve": solve, "rank": rank, "track": track, "reconstruct": reconstruct, "export": export}[options.command](
-        options
-    )
+    by_name = {f.__name__: f for f in (solve, rank, track, reconstruct, batch, export)}
+    by_name[options.command](options)
 
 
 def solve(options: argparse.Namespace) -> None:
@@ -89,6 +88,33 @@ def reconstruct(options: argparse.Namespace) -> None:
     _say(options, _summary(answer) | {"out": options.out})
 
 
+def batch(options: argparse.Namespace) -> None:
+    """``torchrecon batch``."""
+    from torchrecon.pipeline.batch import BatchSettings, run_batch
+    from torchrecon.pipeline.workers import available_cores
+
+    if options.threads < 1 or (options.workers is not None and options.workers < 0):
+        raise ReconError("--workers and --threads: positive numbers are needed (--workers 0: in this process)")
+    camera = None if options.camera is None else Path(options.camera)
+    settings = BatchSettings(
+        _rank(options.rank), options.solver, camera, _config(options), options.device, options.seed
+    )
+    workers = max(1, available_cores() // options.threads) if options.workers is None else options.workers
+    manifest = run_batch(
+        Path(options.folder),
+        Path(options.out),
+        settings,
+        workers=workers,
+        threads=options.threads,
+        force=options.force,
+        progress=True,
+    )
+    _say(options, manifest["counts"] | {"out": options.out})
+    failed = [item["name"] for item in manifest["items"] if item["status"] == "failed"]
+    if failed:
+        raise ReconError(f"{', '.join(failed)}: failed; {options.out}/manifest.json says why, the rest is done")
+
+
 def export(options: argparse.Namespace) -> None:
     """``torchrecon export``."""
     from torchrecon.io.export import export_reconstruction, to_motion
@@ -112,7 +138,8 @@ def _tracks_of(options: argparse.Namespace, reconstruction: Path) -> Path | None
     if options.tracks is not None:
         return Path(options.tracks)
     beside = reconstruction.with_name("tracks.npz")
-    return beside if beside.is_file() and reconstruction.with_name("run.json").is_file() else None
+    of_a_run = any(reconstruction.with_name(name).is_file() for name in ("run.json", "item.json"))
+    return beside if of_a_run and beside.is_file() else None
 
 
 def _config(options: argparse.Namespace) -> Any:

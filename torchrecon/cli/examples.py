@@ -30,6 +30,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("torchrecon reconstruct frames/ -o out/ --depth depth/ --camera camera.json", "measured depth: metres"),
         ("torchrecon reconstruct clip.mp4 -o out/ --rank 2 --force", "replaces an earlier run's results"),
     ),
+    "batch": (
+        ("torchrecon batch clips/ -o results/", "each clip to results/NAME/; run it again to go on"),
+        ("torchrecon batch clips/ -o results/ --workers 4 --json", "four processes, the counts as JSON"),
+    ),
     "export": (
         ("torchrecon export out/reconstruction.npz -o walk.bvh", "joint angles for Blender"),
         ("torchrecon export out/reconstruction.npz -o walk.trc --height 1.75", "OpenSim, a person of 1.75 m"),

@@ -45,6 +45,17 @@ def build_parser() -> argparse.ArgumentParser:
     reconstruct.add_argument("--solver", default="auto", metavar="NAME", help="solver (default: auto)")
     reconstruct.add_argument("--force", action="store_true", help="replace another run's results in DIR")
 
+    batch = _command(commands, "batch", "every clip and tracks file of a folder, each to a folder of its own")
+    batch.add_argument("folder", metavar="FOLDER", help="holds videos, folders of images, tracks files")
+    batch.add_argument("-o", "--out", required=True, metavar="OUT", help="OUT/NAME/ for each, and manifest.json")
+    batch.add_argument("--workers", type=int, metavar="N", help="processes (default: one for each core)")
+    batch.add_argument("--threads", type=int, default=1, metavar="N", help="threads of each process (default: 1)")
+    batch.add_argument("--rank", default="auto", metavar="auto|INT", help="number of shape bases (default: auto)")
+    batch.add_argument("--solver", default="auto", metavar="NAME", help="solver (default: auto)")
+    batch.add_argument("--camera", metavar="FILE", help="camera JSON, the same for all")
+    batch.add_argument("--config", metavar="FILE", help="YAML with stage parameters (see configs/)")
+    batch.add_argument("--force", action="store_true", help="replace the results of a batch with other settings")
+
     export = _command(commands, "export", "reconstruction to other programs' formats, chosen by the suffix")
     export.add_argument("reconstruction", metavar="RECON.npz", help="what solve and reconstruct write")
     export.add_argument(
