@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -142,3 +144,30 @@ def test_a_killed_batch_leaves_whole_files_and_the_next_run_finishes(folder, tmp
     check_whole(out)
     run_batch(folder, out, SETTINGS, workers=0)
     assert results(out) == results(tmp_path / "calm")
+
+
+DDP_JOB = """
+import sys
+from lightning import Trainer
+from torchrecon.pipeline.batch import BatchSettings
+from torchrecon.pipeline.predict import BatchPredictor
+
+trainer = Trainer(
+    accelerator="cpu", devices=2, strategy="ddp", logger=False, enable_progress_bar=False, enable_model_summary=False
+)
+trainer.predict(BatchPredictor(sys.argv[1], sys.argv[2], BatchSettings(rank=1, solver="rigid")))
+"""
+
+
+def test_two_processes_of_torchrun_share_the_work(folder, tmp_path):
+    calm, out = tmp_path / "calm", tmp_path / "out"
+    run_batch(folder, calm, SETTINGS, workers=0)
+    (tmp_path / "job.py").write_text(DDP_JOB)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1]), "OMP_NUM_THREADS": "1"}
+    command += [str(tmp_path / "job.py"), str(folder), str(out)]
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=300
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert results(out) == results(calm)
