@@ -116,6 +116,27 @@ def test_names_kinds_and_refusals(tmp_path, capsys):
     assert "Traceback" not in printed.err
 
 
+def test_a_folder_with_frames_brings_its_masks_depth_and_camera(tmp_path, monkeypatch):
+    for name in ("all/frames", "all/masks", "all/depth", "bare/frames", "images"):
+        (tmp_path / "in" / name).mkdir(parents=True)
+    (tmp_path / "in" / "images" / "0.png").touch()
+    (tmp_path / "in" / "all" / "cameras.json").touch()
+    given: dict[str, list[object]] = {}
+
+    def record(video, out, *, masks, depth, camera, **rest):
+        given[out.name] = [None if p is None else str(p.relative_to(tmp_path)) for p in (video, masks, depth, camera)]
+        raise ReconError("seen")
+
+    monkeypatch.setattr(module, "reconstruct_video", record)
+    settings = BatchSettings(camera=tmp_path / "common.json")
+    assert set(states(run_batch(tmp_path / "in", tmp_path / "out", settings, workers=0)).values()) == {"failed"}
+    assert given == {
+        "all": ["in/all/frames", "in/all/masks", "in/all/depth", "in/all/cameras.json"],
+        "bare": ["in/bare/frames", None, None, "common.json"],
+        "images": ["in/images", None, None, "common.json"],
+    }
+
+
 def test_an_unexpected_error_is_recorded_and_the_next_item_runs(folder, tmp_path, monkeypatch):
     def fail(path):
         if path.stem == "a":

@@ -118,3 +118,14 @@ def test_a_missing_extra_is_named_with_its_gift(monkeypatch):
     assert extra["missing"] == ["no-such-distribution"]
     assert extra["install"] == "pip install 'torchrecon[io]'"
     assert any("C3D" in line and "pip install" in line for line in doctor._lines(doctor.examine()))
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    command = [sys.executable, "-m", "torchrecon", "completion", "bash"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()  # before a word is written
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait() == 0

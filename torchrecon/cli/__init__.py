@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 from torchrecon.cli.parser import build_parser
@@ -22,10 +23,13 @@ def main(arguments: list[str] | None = None) -> int:
     module = options.command if options.command in ("doctor", "completion") else "commands"
     try:
         importlib.import_module(f"torchrecon.cli.{module}").run(options)
+        sys.stdout.flush()
     except ReconError as error:
         print(f"torchrecon {options.command}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"torchrecon {options.command}: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever reads the output, like head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0

@@ -46,7 +46,11 @@ def build_parser() -> argparse.ArgumentParser:
     reconstruct.add_argument("--force", action="store_true", help="replace another run's results in DIR")
 
     batch = _command(commands, "batch", "every clip and tracks file of a folder, each to a folder of its own")
-    batch.add_argument("folder", metavar="FOLDER", help="holds videos, folders of images, tracks files")
+    batch.add_argument(
+        "folder",
+        metavar="FOLDER",
+        help="holds videos, folders of images (or NAME/{frames,masks,depth,camera.json}), tracks files",
+    )
     batch.add_argument("-o", "--out", required=True, metavar="OUT", help="OUT/NAME/ for each, and manifest.json")
     batch.add_argument("--workers", type=int, metavar="N", help="processes (default: one for each core)")
     batch.add_argument("--threads", type=int, default=1, metavar="N", help="threads of each process (default: 1)")

@@ -41,7 +41,8 @@ class BatchItem:
 
     Attributes:
         name: of its folder under the output folder.
-        source: video file, folder of images, tracks file, or folder of keypoint files.
+        source: video file, folder of images, folder that holds ``frames/`` and, where there are any, ``masks/``,
+            ``depth/`` and ``camera.json`` or ``cameras.json``, tracks file, or folder of keypoint files.
         kind: ``video``, ``tracks``, or ``skipped``.
         reason: why it is skipped.
     """
@@ -112,6 +113,8 @@ def _kind(entry: Path) -> tuple[Literal["video", "tracks", "skipped"], str]:
         )
     if (entry / RUN_FILE).exists() or (entry / MANIFEST).exists():
         return "skipped", "holds results of torchrecon"
+    if (entry / "frames").is_dir():
+        return "video", ""
     suffixes = {file.suffix.lower() for file in entry.iterdir() if file.is_file()}
     if suffixes & _IMAGES:
         return "video", ""
@@ -227,11 +230,16 @@ def run_item(item: BatchItem, out: Path, settings: BatchSettings) -> dict[str, A
 
 
 def _reconstruct_video(item: BatchItem, folder: Path, settings: BatchSettings) -> Reconstruction:
+    source = item.source
+    kit = (source / "frames").is_dir()
+    own = [source / name for name in ("camera.json", "cameras.json") if kit and (source / name).is_file()]
     # The folder is this item's, whatever settings an earlier batch had: force.
     return reconstruct_video(
-        item.source,
+        source / "frames" if kit else source,
         folder,
-        camera=settings.camera,
+        masks=source / "masks" if kit and (source / "masks").is_dir() else None,
+        depth=source / "depth" if kit and (source / "depth").is_dir() else None,
+        camera=own[0] if own else settings.camera,
         config=settings.config,
         rank=settings.rank,
         solver=settings.solver,
@@ -310,7 +318,7 @@ def write_manifest(folder: Path, items: Sequence[BatchItem], out: Path, settings
 
 def _fingerprint(source: Path) -> list[int]:
     """Number of files, bytes and time of the last change: enough to see that an input was replaced."""
-    files = [source] if source.is_file() else [file for file in source.iterdir() if file.is_file()]
+    files = [source] if source.is_file() else [file for file in source.rglob("*") if file.is_file()]
     stats = [file.stat() for file in files]
     return [len(stats), sum(s.st_size for s in stats), max((s.st_mtime_ns for s in stats), default=0)]
 
