@@ -129,3 +129,10 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert process.stderr.read() == b""
     process.stderr.close()
     assert process.wait() == 0
+
+
+def test_help_and_completion_load_nothing_heavy():
+    code = "import sys\nfrom torchrecon.cli import main\nmain(['completion', 'fish'])\n"
+    code += "try:\n    main(['export', '--help'])\nexcept SystemExit:\n    pass\n"
+    code += "assert not {'torch', 'numpy', 'cv2', 'lightning'} & {name.split('.')[0] for name in sys.modules}"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
