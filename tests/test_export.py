@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import torchrecon as tr
 from torchrecon.data.mocap import read_bvh
 from torchrecon.io.export import FORMATS, export_reconstruction, to_motion
+from torchrecon.io.writers import mp4
 from torchrecon.io.writers.motion import Motion
 from torchrecon.io.writers.skeleton import fit_skeleton, rigid_tree, root_tree
 
@@ -350,6 +351,7 @@ def test_mp4_shows_rings_dots_and_bones_where_they_belong(tmp_path):
     rec = tr.Reconstruction(**{**vars(rec), "translation": points.mean(1)[:, :2]})
     xy = points[..., :2].clone()
     xy[:, 1, 1] += 20  # the second point was measured 20 pixels below where the reconstruction has it
+    xy[5, 1] = torch.nan
     tracks = tr.Tracks(xy, fps=10.0, edges=[(0, 1)])
     path = export_reconstruction(rec, tmp_path / "a.mp4", fps=10.0, tracks=tracks, video=tmp_path / "frames")
     capture = cv2.VideoCapture(str(path))
@@ -360,9 +362,9 @@ def test_mp4_shows_rings_dots_and_bones_where_they_belong(tmp_path):
         assert image.shape == (96, 128, 3)
         image = image.astype(int)
         left = round(70.0 + 8 * f)
-        if left < 126:
-            assert image[80, left, 2] > image[80, left, 0] + 40  # an orange dot on the measurement
-            assert image[70, left, 2] > 60  # and a line from it to the ring
+        # An orange dot on the measurement, a line from it to the ring; neither where the point was not seen.
+        assert (image[80, left, 2] > image[80, left, 0] + 40) == (f < 5)
+        assert (image[70, left, 2] > 60) == (f < 5)
         assert image[45, round(45.0 + 8 * f)].max() > 80  # the bone's middle
         assert image[10:20].max() < 60  # nothing where nothing is
     assert not capture.read()[0]
@@ -370,6 +372,17 @@ def test_mp4_shows_rings_dots_and_bones_where_they_belong(tmp_path):
         export_reconstruction(made(points[:5].numpy()), tmp_path / "b.mp4", video=tmp_path / "frames")
     with pytest.raises(tr.ReconError, match="--video"):
         export_reconstruction(rec, tmp_path / "b.mp4")
+
+
+def test_rings_are_blue_where_seen_and_grey_where_inferred():
+    cv2 = pytest.importorskip("cv2")
+    rings = np.array([[20.0, 20.0], [60.0, 20.0], [1e9, np.nan]])  # the last cannot be drawn
+    image = np.zeros((40, 80, 3), np.uint8)
+    mp4._draw(cv2, image, rings, np.array([[20.0, 20.0], [np.nan, np.nan], [5.0, 35.0]]), 6)
+    for x, colour in ((26, mp4._RING), (66, mp4._INFERRED)):  # thin lines are smoothed: the hue stays
+        np.testing.assert_allclose(image[20, x] / image[20, x].max(), np.array(colour) / max(colour), atol=0.02)
+    assert image[20, 20].tolist() == image[35, 5].tolist() == list(mp4._DOT)
+    assert image[20, 60].tolist() == [0, 0, 0]
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is not None, reason="rerun-sdk is installed")

@@ -18,7 +18,7 @@ from torchrecon.measurement import Reconstruction, Tracks
 __all__ = ["encode"]
 
 # Blue, green and red of colours that the colour-blind tell apart; sizes in pixels.
-_RING, _DOT, _BONE = (233, 180, 86), (0, 94, 213), (255, 255, 255)
+_RING, _DOT, _BONE, _INFERRED = (233, 180, 86), (0, 94, 213), (255, 255, 255), (120, 120, 120)
 _SHIFT = 4  # OpenCV draws at 1/16 of a pixel
 
 
@@ -31,7 +31,7 @@ def encode(
     """MPEG-4 video of the size and rate of the clip.
 
     Blue rings stand where the reconstruction is seen, orange dots where the tracks were measured, a line joins the
-    two.
+    two. With tracks, rings of points that were not seen in a frame are grey.
 
     Args:
         frames: the clip that was reconstructed.
@@ -74,13 +74,14 @@ def _seen(tracks: Tracks, frame: int) -> NDArray[np.float64]:
 def _draw(
     cv2: Any, image: NDArray[np.uint8], rings: NDArray[np.float64], dots: NDArray[np.float64] | None, radius: int
 ) -> None:
-    for index, ring in enumerate(rings):
-        if dots is not None and np.isfinite(dots[index]).all():
-            _line(cv2, image, dots[index], ring, _DOT)
+    seen = np.isfinite(rings if dots is None else dots).all(axis=-1).reshape(-1)
+    for index in np.argsort(seen, kind="stable"):  # what was measured lies on top
+        if dots is not None and seen[index]:
+            _line(cv2, image, dots[index], rings[index], _DOT)
             if (at := _fixed(dots[index])) is not None:
                 cv2.circle(image, at, radius << (_SHIFT - 1), _DOT, -1, cv2.LINE_AA, _SHIFT)
-        if (at := _fixed(ring)) is not None:
-            cv2.circle(image, at, radius << _SHIFT, _RING, 1, cv2.LINE_AA, _SHIFT)
+        if (at := _fixed(rings[index])) is not None:
+            cv2.circle(image, at, radius << _SHIFT, _RING if seen[index] else _INFERRED, 1, cv2.LINE_AA, _SHIFT)
 
 
 def _line(cv2: Any, image: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64], colour: Any) -> None:
