@@ -406,6 +406,21 @@ def test_height_scales_to_the_stature_and_depth_is_metres(rec, tracks):
     assert [to_motion(r, tracks=t).unit for r, t in ((rec, tracks), (ray, None), (ray, seen))] == ["px", "unit", "m"]
 
 
+def test_placed_points_are_seen_where_the_reconstruction_is(rec):
+    k = torch.tensor([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    far = torch.tensor([[0.1, 0.2, 9.0]]) + torch.arange(4.0)[:, None]
+    seen = tr.Reconstruction(**{**vars(rec), "intrinsics": k, "translation": far, "scale": torch.full((4,), 0.5)})
+    x, y, z = np.moveaxis(to_motion(seen, place=True).points, -1, 0)
+    np.testing.assert_allclose(np.stack([500 * x / z + 320, 510 * y / z + 240], -1), seen.reproject(), atol=1e-9)
+    with pytest.raises(tr.ReconError, match="--place needs intrinsics"):
+        to_motion(rec, place=True)
+
+
+@pytest.mark.parametrize("suffix", sorted(set(FORMATS) - {".rrd"}))
+def test_one_frame_of_one_point_can_be_written(suffix):
+    assert FORMATS[suffix](Motion(np.ones((1, 1, 3))))
+
+
 def test_what_cannot_be_written_is_named(rec, tracks, tmp_path):
     def refuse(words, path="a.csv", **options):
         with pytest.raises(tr.ReconError, match=words):

@@ -125,10 +125,10 @@ def export(options: argparse.Namespace) -> None:
     tracks = None if tracks_file is None else load_tracks(tracks_file)
     if out.exists() and out.samefile(source):
         raise ReconError(f"{out}: is the reconstruction itself; choose another name")
-    scales = {"unit_scale": options.unit_scale, "height_m": options.height}
-    unit = to_motion(reconstruction, options.fps, tracks, **scales).unit
+    how = {"unit_scale": options.unit_scale, "height_m": options.height, "place": options.place}
+    unit = to_motion(reconstruction, options.fps, tracks, **how).unit
     path = export_reconstruction(
-        reconstruction, options.out, options.fps, tracks=tracks, **scales, video=options.video, force=options.force
+        reconstruction, options.out, options.fps, tracks=tracks, **how, video=options.video, force=options.force
     )
     _say(options, {"out": str(path), "unit": unit, "tracks": None if tracks_file is None else str(tracks_file)})
 

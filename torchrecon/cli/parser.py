@@ -70,6 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
     scale = export.add_mutually_exclusive_group()
     scale.add_argument("--height", type=float, metavar="M", help="stature of the person: scales the result to metres")
     scale.add_argument("--unit-scale", type=float, metavar="X", help="metres per unit of the reconstruction")
+    export.add_argument("--place", action="store_true", help="keep the place before the camera; needs intrinsics")
     export.add_argument("--video", metavar="VIDEO", help="the clip, for .mp4")
     export.add_argument("--force", action="store_true", help="replace an earlier sequence of .ply files")
 

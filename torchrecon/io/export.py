@@ -38,6 +38,7 @@ def export_reconstruction(
     edges: Sequence[tuple[int, int]] | None = None,
     unit_scale: float | None = None,
     height_m: float | None = None,
+    place: bool = False,
     video: str | os.PathLike[str] | None = None,
     force: bool = False,
 ) -> Path:
@@ -54,6 +55,8 @@ def export_reconstruction(
         unit_scale: metres per unit of the reconstruction.
         height_m: stature of the person in metres, instead of ``unit_scale``: what the median over the frames of the
             vertical extent of the points is scaled to. Right for a person who mostly stands upright in the picture.
+        place: keep where the camera saw the shape, the camera at the origin, instead of centring every frame; needs
+            intrinsics.
         video: the clip, for ``.mp4``, which shows the tracks and the reprojection on it.
         force: replace the files of an earlier sequence of PLY files.
 
@@ -82,7 +85,7 @@ def export_reconstruction(
     if not sequence and suffix not in FORMATS:
         known = ", ".join([*FORMATS, ".mp4"])
         raise ReconError(f"{target}: cannot export to {target.suffix or 'no suffix'}; use one of {known}")
-    motion = to_motion(reconstruction, fps, tracks, names, edges, unit_scale, height_m)
+    motion = to_motion(reconstruction, fps, tracks, names, edges, unit_scale, height_m, place)
     if sequence:
         return _write_sequence(motion, target, "%" in target.name, force)
     return write_bytes(target, FORMATS[suffix](motion))
@@ -96,6 +99,7 @@ def to_motion(
     edges: Sequence[tuple[int, int]] | None = None,
     unit_scale: float | None = None,
     height_m: float | None = None,
+    place: bool = False,
 ) -> Motion:
     """What :func:`export_reconstruction` writes, arguments as there; its ``unit`` says what the numbers are.
 
@@ -111,7 +115,12 @@ def to_motion(
         ('px', [-0.9, 0.9])
     """
     _check_tracks(reconstruction, tracks)
-    points = reconstruction.points3d.detach().cpu().double().numpy()
+    shape = reconstruction.points3d
+    if place:
+        if reconstruction.intrinsics is None:
+            raise ReconError("export: --place needs intrinsics; without them the distance to the camera is not known")
+        shape = shape * reconstruction.scale[:, None, None] + reconstruction.translation[:, None]
+    points = shape.detach().cpu().double().numpy()
     unit = "px" if reconstruction.intrinsics is None else "unit"
     if tracks is not None and tracks.depth is not None:
         unit = "m"
