@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -29,8 +30,30 @@ def test_solve_writes_a_reconstruction(tracks_file, tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["rank"] == 1
     assert tr.Reconstruction.load(out).points3d.shape == (24, 14, 3)
-    assert main(["export", str(out), "-o", str(tmp_path / "r.csv")]) == 0
-    assert (tmp_path / "r.csv").is_file()
+
+
+def test_export_takes_rate_and_names_from_the_tracks_of_the_run(tracks_file, tmp_path, capsys):
+    out = tmp_path / "reconstruction.npz"
+    tracks = tr.load_tracks(tracks_file)
+    dataclasses.replace(tracks, fps=50.0, names=[f"joint {i}" for i in range(14)]).save(tracks_file)
+    assert main(["solve", str(tracks_file), "-o", str(out), "--rank", "1", "--solver", "rigid"]) == 0
+    assert main(["export", str(out), "-o", str(tmp_path / "r.trc")]) == 0
+    assert "p13" in (tmp_path / "r.trc").read_text()
+    capsys.readouterr()
+    (tmp_path / "run.json").write_text("{}")  # now the tracks beside it are known to be of the same run
+    assert main(["export", str(out), "-o", str(tmp_path / "r.trc"), "--height", "1.8", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "out": str(tmp_path / "r.trc"),
+        "unit": "m",
+        "tracks": str(tracks_file),
+    }
+    lines = (tmp_path / "r.trc").read_text().splitlines()
+    assert lines[2].split("\t")[:5] == ["50", "50", "24", "14", "m"]
+    assert lines[3].split("\t")[2] == "joint_0"
+    before = out.read_bytes()
+    assert main(["export", str(out), "-o", str(out)]) == 2
+    assert "itself" in capsys.readouterr().err
+    assert out.read_bytes() == before
 
 
 def test_rank_prints_exactly_the_fields(tracks_file, tmp_path, capsys):

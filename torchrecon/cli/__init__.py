@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import sys
 
 from torchrecon.cli.parser import build_parser
@@ -17,14 +19,17 @@ def main(arguments: list[str] | None = None) -> int:
         0 when done, 2 for unusable input (one sentence on stderr), 130 when interrupted.
     """
     options = build_parser().parse_args(arguments)
-    from torchrecon.cli import commands
-
+    # The first two have to work where torch does not.
+    module = options.command if options.command in ("doctor", "completion") else "commands"
     try:
-        commands.run(options)
+        importlib.import_module(f"torchrecon.cli.{module}").run(options)
+        sys.stdout.flush()
     except ReconError as error:
         print(f"torchrecon {options.command}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"torchrecon {options.command}: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever reads the output, like head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0

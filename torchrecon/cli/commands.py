@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,9 +23,8 @@ def run(options: argparse.Namespace) -> None:
         torch.empty(0, device=options.device)
     except (RuntimeError, AssertionError) as error:  # a build without that backend fails an assertion inside torch
         raise ReconError(f"--device {options.device}: is not available here ({error})") from error
-    {"solve": solve, "rank": rank, "track": track, "reconstruct": reconstruct, "export": export}[options.command](
-        options
-    )
+    by_name = {f.__name__: f for f in (solve, rank, track, reconstruct, batch, export)}
+    by_name[options.command](options)
 
 
 def solve(options: argparse.Namespace) -> None:
@@ -88,12 +88,58 @@ def reconstruct(options: argparse.Namespace) -> None:
     _say(options, _summary(answer) | {"out": options.out})
 
 
+def batch(options: argparse.Namespace) -> None:
+    """``torchrecon batch``."""
+    from torchrecon.pipeline.batch import BatchSettings, run_batch
+    from torchrecon.pipeline.workers import available_cores
+
+    if options.threads < 1 or (options.workers is not None and options.workers < 0):
+        raise ReconError("--workers and --threads: positive numbers are needed (--workers 0: in this process)")
+    camera = None if options.camera is None else Path(options.camera)
+    settings = BatchSettings(
+        _rank(options.rank), options.solver, camera, _config(options), options.device, options.seed
+    )
+    workers = max(1, available_cores() // options.threads) if options.workers is None else options.workers
+    manifest = run_batch(
+        Path(options.folder),
+        Path(options.out),
+        settings,
+        workers=workers,
+        threads=options.threads,
+        force=options.force,
+        progress=True,
+    )
+    _say(options, manifest["counts"] | {"out": options.out})
+    failed = [item["name"] for item in manifest["items"] if item["status"] == "failed"]
+    if failed:
+        raise ReconError(f"{', '.join(failed)}: failed; {options.out}/manifest.json says why, the rest is done")
+
+
 def export(options: argparse.Namespace) -> None:
     """``torchrecon export``."""
-    from torchrecon.io.export import export_reconstruction
+    from torchrecon.io.export import export_reconstruction, to_motion
+    from torchrecon.io.tracks import load_tracks
 
-    path = export_reconstruction(Reconstruction.load(options.reconstruction), options.out, options.fps)
-    _say(options, {"out": str(path)})
+    source, out = Path(options.reconstruction), Path(options.out)
+    reconstruction, tracks_file = Reconstruction.load(source), _tracks_of(options, source)
+    tracks = None if tracks_file is None else load_tracks(tracks_file)
+    if out.exists() and out.samefile(source):
+        raise ReconError(f"{out}: is the reconstruction itself; choose another name")
+    how = {"unit_scale": options.unit_scale, "height_m": options.height, "place": options.place}
+    unit = to_motion(reconstruction, options.fps, tracks, **how).unit
+    path = export_reconstruction(
+        reconstruction, options.out, options.fps, tracks=tracks, **how, video=options.video, force=options.force
+    )
+    _say(options, {"out": str(path), "unit": unit, "tracks": None if tracks_file is None else str(tracks_file)})
+
+
+def _tracks_of(options: argparse.Namespace, reconstruction: Path) -> Path | None:
+    """The tracks that were named, else those of the run whose folder holds the reconstruction."""
+    if options.tracks is not None:
+        return Path(options.tracks)
+    beside = reconstruction.with_name("tracks.npz")
+    of_a_run = any(reconstruction.with_name(name).is_file() for name in ("run.json", "item.json"))
+    return beside if of_a_run and beside.is_file() else None
 
 
 def _config(options: argparse.Namespace) -> Any:

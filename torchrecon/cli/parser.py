@@ -5,14 +5,9 @@ from __future__ import annotations
 import argparse
 
 import torchrecon
+from torchrecon.cli.examples import EXAMPLES
 
 __all__ = ["build_parser"]
-
-_EXAMPLES = """examples:
-  torchrecon reconstruct clip.mp4 -o out/            a video of a moving person to 3D
-  torchrecon solve tracks.npz -o shape.npz           point tracks to 3D
-  torchrecon rank tracks.npz --json                  how many shape bases stand above the noise
-"""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -20,7 +15,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="torchrecon",
         description="Tracked points on something that bends, in; its 3D shape over time, out.",
-        epilog=_EXAMPLES,
+        epilog=_examples(""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=torchrecon.__version__)
@@ -34,7 +29,7 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--camera", metavar="FILE", help="camera JSON with the 3x3 intrinsics")
 
     rank = _command(commands, "rank", "number of shape bases of a tracks file")
-    rank.add_argument("tracks", metavar="TRACKS")
+    rank.add_argument("tracks", metavar="TRACKS", help="as for solve")
     rank.add_argument("-o", "--out", metavar="OUT.json", help="also write the result here")
     rank.add_argument("--rule", default="auto", metavar="NAME", help="rule (default: auto)")
     rank.add_argument("--layout", choices=["vector", "stack"], help="default: the rule's own")
@@ -45,22 +40,69 @@ def build_parser() -> argparse.ArgumentParser:
 
     reconstruct = _command(commands, "reconstruct", "video to tracks, reconstruction and report")
     _video(reconstruct)
-    reconstruct.add_argument("-o", "--out", required=True, metavar="DIR")
-    reconstruct.add_argument("--rank", default="auto", metavar="auto|INT")
-    reconstruct.add_argument("--solver", default="auto", metavar="NAME")
+    reconstruct.add_argument("-o", "--out", required=True, metavar="DIR", help="holds everything of this run")
+    reconstruct.add_argument("--rank", default="auto", metavar="auto|INT", help="number of shape bases (default: auto)")
+    reconstruct.add_argument("--solver", default="auto", metavar="NAME", help="solver (default: auto)")
     reconstruct.add_argument("--force", action="store_true", help="replace another run's results in DIR")
 
+    batch = _command(commands, "batch", "every clip and tracks file of a folder, each to a folder of its own")
+    batch.add_argument(
+        "folder",
+        metavar="FOLDER",
+        help="holds videos, folders of images (or NAME/{frames,masks,depth,camera.json}), tracks files",
+    )
+    batch.add_argument("-o", "--out", required=True, metavar="OUT", help="OUT/NAME/ for each, and manifest.json")
+    batch.add_argument("--workers", type=int, metavar="N", help="processes (default: one for each core)")
+    batch.add_argument("--threads", type=int, default=1, metavar="N", help="threads of each process (default: 1)")
+    batch.add_argument("--rank", default="auto", metavar="auto|INT", help="number of shape bases (default: auto)")
+    batch.add_argument("--solver", default="auto", metavar="NAME", help="solver (default: auto)")
+    batch.add_argument("--camera", metavar="FILE", help="camera JSON, the same for all")
+    batch.add_argument("--config", metavar="FILE", help="YAML with stage parameters (see configs/)")
+    batch.add_argument("--force", action="store_true", help="replace the results of a batch with other settings")
+
     export = _command(commands, "export", "reconstruction to other programs' formats, chosen by the suffix")
-    export.add_argument("reconstruction", metavar="RECON.npz")
-    export.add_argument("-o", "--out", required=True, metavar="FILE.{csv,ply,trc,c3d}")
-    export.add_argument("--fps", type=float, default=25.0, help="frames per second of the clip (default: 25)")
+    export.add_argument("reconstruction", metavar="RECON.npz", help="what solve and reconstruct write")
+    export.add_argument(
+        "-o", "--out", required=True, metavar="FILE", help=".bvh .c3d .csv .glb .mp4 .npz .ply .rrd .trc"
+    )
+    export.add_argument("--tracks", metavar="TRACKS", help="rate, names, bones (default: those of RECON's own run)")
+    export.add_argument("--fps", type=float, help="frames per second (default: that of the tracks, else 25)")
+    scale = export.add_mutually_exclusive_group()
+    scale.add_argument("--height", type=float, metavar="M", help="stature of the person: scales the result to metres")
+    scale.add_argument("--unit-scale", type=float, metavar="X", help="metres per unit of the reconstruction")
+    export.add_argument("--place", action="store_true", help="keep the place before the camera; needs intrinsics")
+    export.add_argument("--video", metavar="VIDEO", help="the clip, for .mp4")
+    export.add_argument("--force", action="store_true", help="replace an earlier sequence of .ply files")
+
+    doctor = _plain(commands, "doctor", "what is installed, and what a missing extra would give")
+    doctor.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
+
+    completion = _plain(commands, "completion", "print the completion script of a shell")
+    completion.add_argument("shell", choices=["bash", "zsh", "fish"], help="whose script to print")
     return parser
+
+
+def _examples(command: str) -> str:
+    width = max(len(line) for line, _ in EXAMPLES[command])
+    return "\n".join(["examples:", *(f"  {line:{width}}   {text}" for line, text in EXAMPLES[command])])
+
+
+def _plain(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str
+) -> argparse.ArgumentParser:
+    return commands.add_parser(
+        name,
+        help=text,
+        description=text[0].upper() + text[1:] + ".",
+        epilog=_examples(name),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
 
 
 def _command(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str
 ) -> argparse.ArgumentParser:
-    command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    command = _plain(commands, name, text)
     command.add_argument("--device", default="cpu", help="torch device (default: cpu)")
     command.add_argument("--seed", type=int, default=0, help="seed of all randomness (default: 0)")
     command.add_argument("--json", action="store_true", help="print the result as JSON on stdout")

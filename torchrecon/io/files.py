@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from torchrecon.measurement._store import read_npz, write_atomic, write_npz
 
-__all__ = ["plain", "read_npz", "write_bytes", "write_json", "write_npz"]
+__all__ = ["plain", "read_npz", "remove_leftovers", "write_bytes", "write_json", "write_npz"]
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
@@ -21,6 +21,23 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
         ReconError: the folder does not exist, or ``path`` is one.
     """
     return write_atomic(path, lambda stream: stream.write(content))
+
+
+def remove_leftovers(folder: Path, names: Iterable[str]) -> None:
+    """Remove what a killed run left of these files under temporary names.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as name:
+        ...     _ = [(Path(name) / file).touch() for file in (".a.json.x1.part", "a.json", ".b.json.x2.part")]
+        ...     remove_leftovers(Path(name), ["a.json"])
+        ...     sorted(file.name for file in Path(name).iterdir())
+        ['.b.json.x2.part', 'a.json']
+    """
+    for name in names:
+        for pattern in (f".{name}.*.part", f".{name}.part*"):
+            for file in folder.glob(pattern):
+                file.unlink(missing_ok=True)
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> Path:

@@ -54,7 +54,8 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     if not source.is_file():
         raise ReconError(f"{source}: no such file")
     try:
-        with np.load(source, allow_pickle=False) as archive:
+        # Opened here: numpy leaves the file open when it turns out to be no archive.
+        with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ReconError(f"{source}: holds one bare array; an .npz archive with named arrays is needed")
             return {name: archive[name] for name in archive.files}

@@ -17,7 +17,7 @@ from torchrecon.config import Config, to_mapping
 from torchrecon.contour import background_paths, find_mover, own_motion
 from torchrecon.errors import ReconError
 from torchrecon.features import track_points
-from torchrecon.io.files import write_json
+from torchrecon.io.files import remove_leftovers, write_json
 from torchrecon.io.frames import FrameSource, load_camera, open_depths, open_frames, open_masks
 from torchrecon.measurement import Reconstruction, Solver, Tracks
 from torchrecon.pipeline.depth import body_depth, with_depth
@@ -147,6 +147,7 @@ def _claim(folder: Path, run: Mapping[str, object], force: bool) -> bool:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ReconError(f"{folder}: cannot be made a folder ({error.strerror})") from error
+    remove_leftovers(folder, [*RESULTS, RUN_FILE])
     record = folder / RUN_FILE
     if record.is_file():
         try:
