@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 
-.PHONY: setup table1 test lint clean
+.PHONY: setup table1 test lint page clean
 
 setup: $(VENV)/.stamp
 
@@ -25,6 +25,10 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	PYTHONPATH=. $(BIN)/lint-imports
+
+# The report page in a headless Chromium (Debian: chromium chromium-driver): size, time to load, frame rate, pictures.
+page: setup
+	$(BIN)/python -m eval.page
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache build *.egg-info

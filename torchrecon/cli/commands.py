@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from typing import Any
 
@@ -22,9 +23,8 @@ def run(options: argparse.Namespace) -> None:
         torch.empty(0, device=options.device)
     except (RuntimeError, AssertionError) as error:  # a build without that backend fails an assertion inside torch
         raise ReconError(f"--device {options.device}: is not available here ({error})") from error
-    {"solve": solve, "rank": rank, "track": track, "reconstruct": reconstruct, "export": export}[options.command](
-        options
-    )
+    commands = {"solve": solve, "rank": rank, "track": track, "reconstruct": reconstruct}
+    (commands | {"report": report, "export": export})[options.command](options)
 
 
 def solve(options: argparse.Namespace) -> None:
@@ -86,6 +86,25 @@ def reconstruct(options: argparse.Namespace) -> None:
         progress=True,
     )
     _say(options, _summary(answer) | {"out": options.out})
+
+
+def report(options: argparse.Namespace) -> None:
+    """``torchrecon report``."""
+    from torchrecon.io.tracks import load_tracks
+    from torchrecon.pipeline.report import write_report
+
+    words = ["torchrecon", "report", options.reconstruction, "-o", options.out]
+    for name in ("tracks", "video"):
+        words += [] if getattr(options, name) is None else [f"--{name}", getattr(options, name)]
+    path = write_report(
+        Reconstruction.load(options.reconstruction),
+        options.out,
+        tracks=None if options.tracks is None else load_tracks(options.tracks),
+        video=options.video,
+        command=shlex.join(words),
+        seed=options.seed,
+    )
+    _say(options, {"bytes": path.stat().st_size, "out": str(path)})
 
 
 def export(options: argparse.Namespace) -> None:

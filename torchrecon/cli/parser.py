@@ -11,6 +11,7 @@ __all__ = ["build_parser"]
 _EXAMPLES = """examples:
   torchrecon reconstruct clip.mp4 -o out/            a video of a moving person to 3D
   torchrecon solve tracks.npz -o shape.npz           point tracks to 3D
+  torchrecon report shape.npz -o report.html         a page that shows it and how far to trust it
   torchrecon rank tracks.npz --json                  how many shape bases stand above the noise
 """
 
@@ -49,6 +50,12 @@ def build_parser() -> argparse.ArgumentParser:
     reconstruct.add_argument("--rank", default="auto", metavar="auto|INT")
     reconstruct.add_argument("--solver", default="auto", metavar="NAME")
     reconstruct.add_argument("--force", action="store_true", help="replace another run's results in DIR")
+
+    report = _command(commands, "report", "page to look at a reconstruction, one file that works offline")
+    report.add_argument("reconstruction", metavar="RECON.npz")
+    report.add_argument("-o", "--out", required=True, metavar="report.html", help="replaced atomically")
+    report.add_argument("--tracks", metavar="TRACKS.npz", help="the tracks it was made from: gaps, confidence, K")
+    report.add_argument("--video", metavar="VIDEO", help="the clip they were found in")
 
     export = _command(commands, "export", "reconstruction to other programs' formats, chosen by the suffix")
     export.add_argument("reconstruction", metavar="RECON.npz")
