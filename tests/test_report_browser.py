@@ -278,6 +278,24 @@ def test_a_page_without_film_tracks_bones_and_covariance_says_so(driver, bare):
     assert severe(driver) == []
 
 
+def test_without_webgl_the_film_and_the_charts_still_work(driver, full):
+    command = "HTMLCanvasElement.prototype.getContext = ((old) => function (kind, ...more) {"
+    command += (
+        "return kind === 'webgl2' ? null : old.call(this, kind, ...more); })(HTMLCanvasElement.prototype.getContext)"
+    )
+    added = driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": command})
+    try:
+        load(driver, full)
+        assert "needs WebGL" in driver.find_element("id", "plea").text
+        before = pixels(driver, "film-canvas", "film-view")
+        press(driver, Keys.END)
+        assert state(driver, "frame") == FRAMES - 1
+        assert (np.abs(before - pixels(driver, "film-canvas", "film-view")).max(-1) > 40).sum() > 50
+        assert severe(driver) == []
+    finally:
+        driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+
+
 def test_nothing_is_wider_than_a_phone_and_every_control_has_a_name(driver, full, bare):
     resize(driver, 390, 844, phone=True, dark=True)
     try:

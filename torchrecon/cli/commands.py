@@ -101,6 +101,7 @@ def report(options: argparse.Namespace) -> None:
         options.out,
         tracks=None if options.tracks is None else load_tracks(options.tracks),
         video=options.video,
+        title=None if options.video is not None else options.reconstruction,
         command=shlex.join(words),
         seed=options.seed,
     )

@@ -44,7 +44,7 @@ def write_report(
         tracks: the tracks it was made from.
         video: the clip they were found in.
         rank: the estimate of K; default: made from ``tracks`` with ``seed``.
-        title: default: the name of the clip, or of the page.
+        title: default: the name of the clip.
         command: the command that made it, for the page to show.
         settings: what the run was asked for, for the page to show.
         seed: of the rank estimate.
@@ -62,7 +62,7 @@ def write_report(
         tracks,
         rank,
         None if frames is None else lambda budget: encode_stills(frames, budget),
-        title=title or (Path(path).stem if video is None else _name(Path(video).resolve())),
+        title=title or ("Reconstruction" if video is None else _name(Path(video).resolve())),
         fps=25.0 if frames is None else frames.fps,
         command=command,
         versions=_versions(),

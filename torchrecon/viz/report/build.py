@@ -47,7 +47,7 @@ def build_report(
     settings: Mapping[str, object] | None = None,
     max_bytes: int = 8_000_000,
 ) -> bytes:
-    """A page that works from disk, without a network, in any current browser.
+    """One HTML file that works from disk, without a network, in any current browser.
 
     It shows the film with the tracks on it, in step with a 3D view that can be turned, front, side and top view, a
     timeline, the evidence for K, gaps, bones, warnings in words and what made it. What was not given is named.
@@ -85,6 +85,8 @@ def build_report(
             f"build_report: the tracks are {tuple(tracks.xy.shape[:-1])} frames x points, the reconstruction is "
             f"{(frames, points)}; give the tracks it was made from"
         )
+    if rank is not None and rank.eigenvalues.ndim != 1:
+        raise ReconError("build_report: one rank estimate at a time; index the batch first")
     data, blocks = content(reconstruction, tracks, rank, film is not None, max_bytes)
     data |= {"title": title, "fps": tracks.fps if tracks is not None else fps}
     data["times"] = [round(t, 6) for t in times_of(tracks, frames, fps)]
@@ -95,7 +97,8 @@ def build_report(
         room = (max_bytes - len(page)) * 3 // 4 - 16 * frames - 4096
         pictures = film(max(room, 0))
         data["film"] = {"every": pictures.every, "sizes": [len(image) for image in pictures.images]}
-        data["size"] = list(pictures.size)
+        # Integer pixel centres: the first pixel begins at -0.5.
+        data |= {"corner": [-0.5, -0.5], "size": list(pictures.size)}
         blocks["film"] = Block(base64.b64encode(b"".join(pictures.images)).decode("ascii"))
         page = _page(title, data, blocks)
     if len(page) > max_bytes:

@@ -60,6 +60,7 @@ const charts = (() => {
       raster = make("canvas", undefined, "raster");
       raster.setAttribute("role", "img");
       raster.setAttribute("aria-label", "Which track is seen in which frame: one row a track, dark where it is seen");
+      raster.classList.toggle("sharp", N < 80);
       const { value } = lane_row("Gaps", "One row a track, in the order of their first sight; filled where it is seen.", "", raster, "gaps");
       value.textContent = N + " rows";
       const born = Array.from({ length: N }, (_, i) => { let f = 0; while (f < F && !A.seen[f * N + i]) f++; return f; });
@@ -72,6 +73,7 @@ const charts = (() => {
     for (let t = 0; total && t <= total * 1.0001; t += every) {
       const tick = make("span", short(t) + "\u202fs");
       tick.style.left = (100 * t) / total + "%";
+      if (t > 0.96 * total) tick.className = "last";
       scale.append(tick);
     }
     ticks.append(make("div", undefined, "lane-name"), scale);

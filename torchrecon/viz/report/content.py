@@ -41,7 +41,7 @@ def content(
     # Wrongly tracked points must not decide the scale of the picture.
     reach, deep = _reach(points, known, seen)
     edges = () if tracks is None or tracks.edges is None else tracks.edges
-    unit = unit_of(rec, tracks)
+    unit, (corner, size) = unit_of(rec, tracks), _canvas(xy)
     drawn, blocks = _fitting(points, xy, known, seen, reach, edges, int(_POINTS_SHARE * max_bytes))
     said = words(rec, tracks, rank, float(seen.mean()), int((~known).sum()))
     notes = [{"kind": word.kind, "title": word.title, "text": word.text} for word in said]
@@ -69,8 +69,9 @@ def content(
         "edges": [[place[a], place[b]] for a, b in edges],
         "reach": reach,
         "deep": deep,
-        "floor": _floor(points, known & seen, reach),
-        "size": _canvas(xy, seen),
+        "floor": _floor(points, known, reach),
+        "corner": corner,
+        "size": size,
         "steps": {"points": blocks["points"].step, "xy": blocks["xy"].step},
         "spread": spread,
         "tracked": tracks is not None,
@@ -137,18 +138,20 @@ def _reach(points: Array, known: Array, seen: Array) -> tuple[float, float]:
     return reach or 1.0, deep or reach or 1.0
 
 
-def _floor(points: Array, counted: Array, reach: float) -> float:
+def _floor(points: Array, known: Array, reach: float) -> float:
     """Height (y down) of the grid under the shape."""
-    return float(np.quantile(points[..., 1][counted], 0.999)) if counted.any() else reach
+    return float(np.quantile(points[..., 1][known], 0.99)) if known.any() else reach
 
 
-def _canvas(xy: Array, seen: Array) -> list[float]:
-    """(height, width) of a picture that holds the tracks, for a page without a film."""
-    inside = xy[seen & finite(xy)]
+def _canvas(xy: Array) -> tuple[list[float], list[float]]:
+    """Corner (x, y) and (height, width) of a picture that holds the points, for a page without a film."""
+    inside = xy[finite(xy)]
     if not len(inside):
-        return [480, 640]
-    right, bottom = np.quantile(inside, 0.999, axis=0)
-    return [float(np.ceil(max(1.05 * bottom, 1))), float(np.ceil(max(1.05 * right, 1)))]
+        return [0.0, 0.0], [480.0, 640.0]
+    low, high = np.quantile(inside, [0.002, 0.998], axis=0)
+    margin = 0.08 * float((high - low).max()) + 1.0
+    wide, tall = (high - low + 2 * margin).tolist()
+    return (low - margin).tolist(), [tall, wide]
 
 
 def _camera(rec: Reconstruction) -> dict[str, Any]:

@@ -54,9 +54,8 @@ const film = (() => {
     fit = { scale, x: (canvas.width - wide * scale) / 2, y: (canvas.height - tall * scale) / 2, ratio };
   }
 
-  // Integer pixel centres: pixel 0 reaches from -0.5 to 0.5.
-  const px = (x) => fit.x + (x + 0.5) * fit.scale;
-  const py = (y) => fit.y + (y + 0.5) * fit.scale;
+  const px = (x) => fit.x + (x - D.corner[0]) * fit.scale;
+  const py = (y) => fit.y + (y - D.corner[1]) * fit.scale;
 
   // Where the reconstruction would be seen.
   function model(f, i) {

@@ -120,7 +120,7 @@ addEventListener("keydown", (event) => {
 function words() {
   $("title").textContent = D.title;
   const last = D.times[F - 1] || 0, rate = F > 1 ? (F - 1) / last : D.fps;
-  $("subtitle").textContent = `${F} frames, ${short(last)}\u202fs at ${short(rate)} per second`;
+  $("subtitle").textContent = `${F} frames · ${short(last)}\u202fs · ${Number(rate.toFixed(2))} frames per second`;
   $("verdict").classList.add(D.status.ok ? "good" : "open");
   $("headline").textContent = D.status.headline + ".";
   $("status").textContent = D.status.text.replace(/^./, (c) => c.toUpperCase()) + (/[.!?]$/.test(D.status.text) ? "" : ".");
@@ -157,7 +157,12 @@ function words() {
 
 function dress() {
   $("film-title").textContent = D.film ? "Film" : D.tracked ? "Tracks" : "Seen from the camera";
-  const deny = (name, why) => { $(toggles[name]).disabled = true; $(toggles[name]).title = why; };
+  const deny = (name, why) => {
+    const button = $(toggles[name]);
+    button.disabled = true;
+    button.title = why;
+    button.setAttribute("aria-pressed", S[name] = false);
+  };
   if (!D.tracked) { deny("trails", "No tracks were given."); deny("model", "No tracks were given."); }
   if (!D.spread) deny("spread", "This solver gives no uncertainty.");
   if (!D.mirror) deny("mirrored", "Perspective tells near from far: there is no mirrored answer.");
@@ -202,7 +207,10 @@ function draw() {
   scrub.setAttribute("aria-valuetext", `frame ${clock}, ${time}`);
 }
 
+let before = 0;
 function tick(now) {
+  if (now - before > 500) since += now - before; // the page was hidden or busy: go on from where it was
+  before = now;
   if (S.playing) advance(now);
   if (stale) {
     stale = false;

@@ -127,7 +127,7 @@ def absences(reconstruction: Reconstruction, tracks: Tracks | None, rank: RankEs
     """What this page does not show, and why."""
     missing: list[str] = []
     if not film:
-        missing.append("Video: none was given, so the tracks stand on an empty picture.")
+        missing.append("Video: none was given, so the points stand on an empty picture.")
     if tracks is None:
         missing.append("Tracks: none were given, so the picture shows where the reconstruction would be seen.")
     elif tracks.covariance is None:
