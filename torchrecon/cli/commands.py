@@ -6,6 +6,7 @@ import argparse
 import json
 import shlex
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -85,7 +86,7 @@ def reconstruct(options: argparse.Namespace) -> None:
         force=options.force,
         progress=True,
     )
-    _say(options, _summary(answer) | {"out": options.out})
+    _say(options, _summary(answer) | {"out": options.out, "report": str(Path(options.out) / "report.html")})
 
 
 def report(options: argparse.Namespace) -> None:
@@ -101,7 +102,7 @@ def report(options: argparse.Namespace) -> None:
         options.out,
         tracks=None if options.tracks is None else load_tracks(options.tracks),
         video=options.video,
-        title=None if options.video is not None else options.reconstruction,
+        title=None if options.video is not None else Path(options.reconstruction).name,
         command=shlex.join(words),
         seed=options.seed,
     )

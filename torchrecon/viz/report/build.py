@@ -64,7 +64,7 @@ def build_report(
         versions: program -> version.
         settings: what the run was asked for, name -> value.
         max_bytes: largest page. The film gets what the points leave; if the points alone need more than half of it,
-            fewer of them are drawn, and the page says so.
+            they are stored coarser, then fewer of them are drawn, and the page says so.
 
     Raises:
         ReconError: a batch, tracks or a rank estimate that do not fit, or more data than ``max_bytes`` can hold.

@@ -53,20 +53,10 @@ const charts = (() => {
       const { value } = lane_row(lane.label, lane.hint, count ? `of ${lane.total}` : with_unit(top, lane.unit), line(lane.values, top, true), "hue" + (index % 5));
       readings.push(() => {
         const now = lane.values[S.frame];
-        value.textContent = count ? String(now) : (lane.sigma && now !== null ? "±\u202f" : "") + with_unit(now, lane.unit);
+        reading(holder, value, count ? String(now) : (lane.sigma && now !== null ? "±\u202f" : "") + with_unit(now, lane.unit));
       });
     });
-    if (A.xy) {
-      raster = make("canvas", undefined, "raster");
-      raster.setAttribute("role", "img");
-      raster.setAttribute("aria-label", "Which track is seen in which frame: one row a track, dark where it is seen");
-      raster.classList.toggle("sharp", N < 80);
-      const { value } = lane_row("Gaps", "One row a track, in the order of their first sight; filled where it is seen.", "", raster, "gaps");
-      value.textContent = N + " rows";
-      const born = Array.from({ length: N }, (_, i) => { let f = 0; while (f < F && !A.seen[f * N + i]) f++; return f; });
-      const life = Array.from({ length: N }, (_, i) => { let n = 0; for (let f = 0; f < F; f++) n += A.seen[f * N + i]; return n; });
-      order = Array.from({ length: N }, (_, i) => i).sort((a, b) => born[a] - born[b] || life[b] - life[a]);
-    }
+    gaps();
     const ticks = make("div", undefined, "ticks"), scale = make("div", undefined, "plot");
     const total = D.times[F - 1] || 0, rough = total / (innerWidth < 600 ? 4 : 8), power = 10 ** Math.floor(Math.log10(rough || 1));
     const every = [1, 2, 5, 10].map((m) => m * power).find((size) => size >= rough) || 1;
@@ -80,12 +70,24 @@ const charts = (() => {
     holder.append(ticks);
   }
 
-  // The raster is one pixel a cell, scaled by the browser.
+  function gaps() {
+    raster = make("canvas", undefined, "raster");
+    raster.setAttribute("role", "img");
+    raster.setAttribute("aria-label", "Which track is seen in which frame: one row a track, filled where it is seen");
+    const hint = "One row a track, in the order of their first sight; filled where it is seen.";
+    lane_row("Gaps", hint, "", raster, "gaps").value.textContent = N + " rows";
+    const born = new Array(N).fill(F), life = new Array(N).fill(0);
+    for (let f = F - 1; f >= 0; f--) for (let i = 0; i < N; i++) if (A.seen[f * N + i]) { born[i] = f; life[i]++; }
+    order = born.map((_, i) => i).sort((a, b) => born[a] - born[b] || life[b] - life[a]);
+  }
+
+  // One pixel a cell, then shrunk once to the size on the screen: the browser would shrink it in every frame.
   function recolour() {
-    if (!raster) return;
-    raster.width = F;
-    raster.height = N;
-    const ctx = raster.getContext("2d"), image = ctx.createImageData(F, N), seen = rgb(css("--cell")), pick = rgb(css("--pick"));
+    if (!raster.clientWidth) return;
+    const cells = document.createElement("canvas");
+    cells.width = F;
+    cells.height = N;
+    const pen = cells.getContext("2d"), image = pen.createImageData(F, N), seen = rgb(css("--cell")), pick = rgb(css("--pick"));
     order.forEach((point, row) => {
       const ink = point === S.chosen ? pick : seen;
       for (let f = 0; f < F; f++) {
@@ -95,7 +97,18 @@ const charts = (() => {
         image.data[at + 3] = 255;
       }
     });
-    ctx.putImageData(image, 0, 0);
+    pen.putImageData(image, 0, 0);
+    raster.width = raster.clientWidth * Math.min(devicePixelRatio || 1, 2);
+    raster.height = raster.clientHeight * Math.min(devicePixelRatio || 1, 2);
+    const ctx = raster.getContext("2d");
+    ctx.imageSmoothingEnabled = N > raster.height / 2;
+    ctx.imageSmoothingQuality = "high";
+    ctx.drawImage(cells, 0, 0, raster.width, raster.height);
+    if (S.chosen < 0) return;
+    // A chosen row must not vanish between thousands.
+    const y = (order.indexOf(S.chosen) * raster.height) / N;
+    ctx.imageSmoothingEnabled = false;
+    ctx.drawImage(cells, 0, order.indexOf(S.chosen), F, 1, 0, Math.floor(y), raster.width, Math.max(3, raster.height / N));
   }
 
   function where(event) {
@@ -155,9 +168,12 @@ const charts = (() => {
   function bones() {
     const part = $("bones");
     $("bones-part").hidden = !D.bones.length;
-    for (const bone of D.bones) {
+    const rows = D.bones.map((bone) => {
       const known = bone.values.filter((value) => value !== null), mean = known.reduce((a, b) => a + b, 0) / (known.length || 1);
       const spread = Math.sqrt(known.reduce((a, b) => a + (b - mean) ** 2, 0) / (known.length || 1));
+      return { bone, mean, spread };
+    });
+    for (const { bone, mean, spread } of rows.sort((a, b) => b.spread / b.mean - a.spread / a.mean)) {
       const row = make("div", undefined, "bone"), field = make("div", undefined, "plot"), now = make("span", "", "value");
       field.append(line(bone.values, Math.max(largest(bone.values), 1.6 * mean), false));
       heads.find((item) => item.part === part).field = field;
@@ -165,7 +181,7 @@ const charts = (() => {
       row.lastChild.title = "Standard deviation over the frames, in per cent of the mean length";
       part.append(row);
       readings.push(() => {
-        now.textContent = with_unit(bone.values[S.frame], D.unit);
+        reading(part, now, with_unit(bone.values[S.frame], D.unit));
       });
     }
   }
@@ -176,7 +192,19 @@ const charts = (() => {
       item.left = item.field.getBoundingClientRect().left - item.part.getBoundingClientRect().left;
       item.width = item.field.clientWidth;
     }
+    recolour();
     scree();
+  }
+
+  // Numbers out of sight are not written: each costs a layout.
+  const sight = new Map();
+  const watch = new IntersectionObserver((entries) => {
+    for (const entry of entries) sight.set(entry.target, entry.isIntersecting);
+    refresh();
+  });
+  function reading(part, node, text) {
+    if (sight.get(part) === false || node.textContent === text) return;
+    node.textContent = text;
   }
 
   function draw() {
@@ -187,6 +215,7 @@ const charts = (() => {
   function open() {
     timeline();
     bones();
+    for (const item of heads) watch.observe(item.part);
   }
 
   return { open, draw, resize, recolour };

@@ -16,7 +16,8 @@ from torchrecon.viz.report.words import absences, headline, unit_of, words
 __all__ = ["content", "plain", "times_of"]
 
 Array = NDArray[Any]
-_FINENESS = 2048  # steps from the centre to the edge of the 3D view, finer than the pixels of a large screen
+# Steps from the centre to the edge of the 3D view, the finest that fits; the last is still finer than a large screen.
+_FINENESS = (2048, 1024, 512)
 _BORDER = 8.0  # positions further out than this many times the view are drawn at the border
 _ELLIPSOIDS = 400  # more of them hide one another
 _POINTS_SHARE = 0.5  # of the page; the film gets the rest
@@ -99,24 +100,37 @@ def content(
 def _fitting(
     points: Array, xy: Array, known: Array, seen: Array, reach: float, edges: Sequence[tuple[int, int]], room: int
 ) -> tuple[Array, dict[str, Block]]:
-    """As many points as fit into ``room`` characters, bones always among them."""
+    """As fine and as many points as fit into ``room`` characters, bones always among them."""
     frames, count = known.shape
     ends = np.unique(np.asarray(edges, dtype=int).reshape(-1))
-    stride = 1
-    while True:
-        drawn = np.union1d(np.arange(0, count, stride), ends)
-        shape = np.where(known[:, drawn, None], np.clip(points[:, drawn], -_BORDER * reach, _BORDER * reach), np.nan)
-        inside = np.where(np.isfinite(xy[:, drawn]), xy[:, drawn], np.nan)
-        size = max(float(np.nanquantile(np.abs(inside), 0.999)), 1.0) if np.isfinite(inside).any() else 1.0
-        blocks = {
-            "points": pack_series(shape.reshape(frames, -1), reach / _FINENESS),
-            "xy": pack_series(inside.reshape(frames, -1), size / 8192),
+    shape = np.where(known[..., None], np.clip(points, -_BORDER * reach, _BORDER * reach), np.nan)
+    flat = np.where(finite(xy)[..., None], xy, np.nan)
+    size = max(float(np.nanquantile(np.abs(flat), 0.999)), 1.0) if finite(xy).any() else 1.0
+
+    def packed(drawn: Array, fineness: int) -> dict[str, Block]:
+        return {
+            "points": pack_series(shape[:, drawn].reshape(frames, -1), reach / fineness),
+            "xy": pack_series(flat[:, drawn].reshape(frames, -1), size / (4 * fineness)),
             "seen": pack_bits(seen[:, drawn]),
             "known": pack_bits(known[:, drawn]),
         }
-        if sum(len(block.text) for block in blocks.values()) <= room or len(drawn) <= max(len(ends), 1):
-            return drawn, blocks
-        stride *= 2
+
+    def length(blocks: Mapping[str, Block]) -> int:
+        return sum(len(block.text) for block in blocks.values())
+
+    rungs = [(1, fineness) for fineness in _FINENESS]
+    rungs += [(2**power, _FINENESS[-1]) for power in range(1, count.bit_length() + 1)]
+    for stride, fineness in rungs:
+        drawn = np.union1d(np.arange(0, count, stride), ends)
+        # A few of the points tell how large all of them will be.
+        few = drawn[:: max(1, len(drawn) // 128)]
+        last = (stride, fineness) == rungs[-1]
+        if not last and length(packed(few, fineness)) * len(drawn) > 1.1 * room * len(few):
+            continue
+        blocks = packed(drawn, fineness)
+        if last or length(blocks) <= room:
+            break
+    return drawn, blocks
 
 
 def _spread(covariance: Array, reach: float) -> Block:

@@ -64,11 +64,11 @@ async function unpack() {
   if (D.film) A.film = bytes_of("film");
 }
 
-// Number with three significant digits, no exponent.
+// Number with two or three significant digits, no exponent.
 function short(value) {
   if (value === null || value === undefined) return "–";
   const size = Math.abs(value);
-  if (size === 0) return "0";
+  if (size < 1e-6) return "0";
   return size >= 100 ? value.toFixed(0) : size >= 10 ? value.toFixed(1) : size >= 0.01 ? value.toFixed(2) : value.toPrecision(2);
 }
 

@@ -4,7 +4,8 @@ const film = (() => {
   const canvas = $("film-canvas"), ctx = canvas.getContext("2d"), view = $("film-view");
   const AHEAD = 12, KEEP = 40, SHADES = 11;
   const pictures = new Map(), starts = [];
-  let fit = { x: 0, y: 0, scale: 1 }, shown = null, shades = [];
+  const dots = document.createElement("canvas");
+  let fit = { x: 0, y: 0, scale: 1, ratio: 1 }, shown = null, shades = [], radius = 3, side = 8;
   const [tall, wide] = D.size;
 
   function open() {
@@ -44,6 +45,7 @@ const film = (() => {
       const t = (2 * i) / (SHADES - 1), [from, to] = t < 1 ? [ramp[0], ramp[1]] : [ramp[1], ramp[2]], s = t < 1 ? t : t - 1;
       return "rgb(" + from.map((v, k) => Math.round(255 * (v + s * (to[k] - v)))).join(" ") + ")";
     });
+    stamp();
   }
 
   function resize() {
@@ -52,6 +54,7 @@ const film = (() => {
     canvas.height = Math.max(1, Math.round(box.height * ratio));
     const scale = Math.min(canvas.width / wide, canvas.height / tall);
     fit = { scale, x: (canvas.width - wide * scale) / 2, y: (canvas.height - tall * scale) / 2, ratio };
+    stamp();
   }
 
   const px = (x) => fit.x + (x - D.corner[0]) * fit.scale;
@@ -77,13 +80,8 @@ const film = (() => {
     return Math.max(0, Math.min(SHADES - 1, Math.round(((z + 1) / 2) * (SHADES - 1))));
   }
 
-  function spot(path, x, y, r) {
-    if (N > 1200) path.rect(x - r, y - r, 2 * r, 2 * r);
-    else { path.moveTo(x + r, y); path.arc(x, y, r, 0, 7); }
-  }
-
   function trails(f) {
-    const from = Math.max(0, f - Math.max(3, Math.min(12, Math.floor(15000 / N))));
+    const from = Math.max(0, f - Math.max(2, Math.min(12, Math.floor(5000 / N))));
     ctx.beginPath();
     for (let i = 0; i < N; i++) {
       if (!A.seen[f * N + i]) continue;
@@ -99,25 +97,37 @@ const film = (() => {
     ctx.stroke();
   }
 
-  function marks(f) {
-    const r = (N < 60 ? 4 : N < 400 ? 3 : N < 1500 ? 2.2 : 1.6) * fit.ratio;
-    const halo = new Path2D(), rings = new Path2D(), by = Array.from({ length: SHADES }, () => new Path2D());
-    for (let i = 0; i < N; i++) {
-      const at = f * N + i;
-      if (A.seen[at]) {
-        const [x, y] = place(f, i);
-        if (N <= 1200) spot(halo, px(x), py(y), r + fit.ratio);
-        spot(by[A.known[at] ? shade(f, i) : SHADES >> 1], px(x), py(y), r);
-      } else if (A.known[at] && (S.model || !D.tracked)) {
-        const [x, y] = place(f, i);
-        spot(rings, px(x), py(y), r);
+  // One picture of a dot for each shade and one of a ring, drawn once: copying them is faster than filling circles.
+  function stamp() {
+    radius = (N < 60 ? 4 : N < 400 ? 3 : N < 1500 ? 2.2 : 1.6) * fit.ratio;
+    side = 2 * Math.ceil(radius + fit.ratio + 1);
+    dots.width = side * (SHADES + 1);
+    dots.height = side;
+    const pen = dots.getContext("2d");
+    for (let i = 0; i <= SHADES; i++) {
+      const ring = i === SHADES, x = side * (i + 0.5), y = side / 2;
+      if (D.film && !ring) {
+        pen.beginPath();
+        pen.arc(x, y, radius + fit.ratio, 0, 7);
+        pen.fillStyle = "rgb(0 0 0 / .5)";
+        pen.fill();
       }
+      pen.beginPath();
+      pen.arc(x, y, radius, 0, 7);
+      pen.lineWidth = fit.ratio;
+      pen.strokeStyle = D.film ? "rgb(255 255 255 / .7)" : css("--faint");
+      pen.fillStyle = shades[i];
+      if (ring) pen.stroke(); else pen.fill();
     }
-    if (D.film) { ctx.fillStyle = "rgb(0 0 0 / .55)"; ctx.fill(halo); }
-    ctx.lineWidth = fit.ratio;
-    ctx.strokeStyle = D.film ? "rgb(255 255 255 / .7)" : css("--faint");
-    ctx.stroke(rings);
-    by.forEach((path, i) => { ctx.fillStyle = shades[i]; ctx.fill(path); });
+  }
+
+  function marks(f) {
+    for (let i = 0; i < N; i++) {
+      const at = f * N + i, seen = A.seen[at];
+      if (!seen && !(A.known[at] && (S.model || !D.tracked))) continue;
+      const [x, y] = place(f, i), kind = !seen ? SHADES : A.known[at] ? shade(f, i) : SHADES >> 1;
+      ctx.drawImage(dots, side * kind, 0, side, side, Math.round(px(x) - side / 2), Math.round(py(y) - side / 2), side, side);
+    }
   }
 
   function bones(f) {

@@ -171,13 +171,13 @@ function dress() {
   $(toggles.mirrored).title ||= "The other answer: near and far swapped";
   $(toggles.spread).title ||= `Ellipsoids of ${scene.SIGMAS} standard deviations` + (D.spread.points.length < N ? `, for ${D.spread.points.length} of the points` : "");
   const cell = scene.cell(), legend = $("shape-legend");
-  const unit = { px: "pixels of the track", m: "m", u: "units" }[D.unit];
+  const unit = D.unit === "u" ? "units" : D.unit;
   for (const [kind, text] of [["seen", "seen"], ["guess", "inferred"]]) {
     const item = make("span");
     item.append(make("i", undefined, "dot " + kind), text);
     legend.append(item);
   }
-  if (cell) legend.append(make("span", `ground square ${Number(short(cell))} ${unit}`));
+  if (cell) legend.append(make("span", `ground square ${Number(cell.toPrecision(3))} ${unit}`));
   if (innerWidth > 700) legend.append(make("span", "drag to turn, wheel to zoom"));
 }
 

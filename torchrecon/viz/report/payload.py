@@ -91,4 +91,4 @@ def hold(values: Array) -> Array:
 
 
 def _text(content: bytes) -> str:
-    return base64.b64encode(zlib.compress(content, 9)).decode("ascii")
+    return base64.b64encode(zlib.compress(content, 7)).decode("ascii")
