@@ -195,8 +195,11 @@ def test_keys_work(page):
     press(page, "m")
     assert state(page, "mirrored") is True
     assert text(page, "said") == "Mirrored answer"
-    press(page, "m", "u")
+    press(page, "m")
+    sure = pixels(page, "shape-canvas", "view-free")
+    press(page, "u")
     assert (state(page, "mirrored"), state(page, "spread")) == (False, True)
+    assert (np.abs(sure - pixels(page, "shape-canvas", "view-free")).max(-1) > 20).sum() > 100
     # The slider keeps its own keys: one step, not two.
     page.find_element("id", "scrub").send_keys(Keys.HOME, Keys.ARROW_RIGHT)
     assert state(page, "frame") == 1

@@ -65,23 +65,24 @@ const scene = (() => {
       }`],
     ellipsoids: [HEAD + `
       layout(location = 0) in vec3 centre; layout(location = 1) in vec3 r0; layout(location = 2) in vec3 r1;
-      uniform float sigmas; out vec2 at;
+      uniform float sigmas; out vec2 at; flat out float strength;
       void main() {
         mat3 root = mat3(r0.x, r0.y, r0.z, r0.y, r1.x, r1.y, r0.z, r1.y, r1.z);
         mat3 m = mat3(look) * mat3(turned(root[0]), turned(root[1]), turned(root[2]));
         vec3 row0 = vec3(m[0].x, m[1].x, m[2].x), row1 = vec3(m[0].y, m[1].y, m[2].y);
         float c = dot(row0, row0), d = dot(row0, row1), e = dot(row1, row1);
         float a = sqrt(max(c, 1e-12)), s = d / a, t = sqrt(max(e - s * s, 0.0));
+        strength = clamp(0.003 / (a * t + 1e-9), 0.07, 1.0); // the same ink, spread over what it covers
         at = vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID >> 1) * 2 - 1);
         vec4 p = look * vec4(turned(centre), 1.0);
         p.xy += sigmas * vec2(a * at.x, s * at.x + t * at.y);
         gl_Position = projection * p;
       }`, FRAGMENT + `
-      in vec2 at; uniform vec3 ink;
+      in vec2 at; flat in float strength; uniform vec3 ink;
       void main() {
         float r = dot(at, at);
         if (r > 1.0) discard;
-        float alpha = mix(0.10, 0.55, pow(r, 4.0));
+        float alpha = strength * mix(0.12, 0.6, pow(r, 5.0));
         o = vec4(ink * alpha, alpha);
       }`],
   };
@@ -268,6 +269,13 @@ const scene = (() => {
       if (main) grid_lines(common);
       ribbons(common, buffers.lines, 0, bones, [...colours.ink, 0.45], (main ? 2 : 1.2) * ratio, pose);
       ribbons(common, buffers.lines, bones, path, [...colours.pick, 0.9], (main ? 1.6 : 1) * ratio, pose);
+      if (uncertain) {
+        gl.depthMask(false);
+        use("ellipsoids", { ...common, sigmas: SIGMAS, ink: colours.accent });
+        attributes(buffers.ellipsoids, [[3, gl.FLOAT, 36, 0], [3, gl.FLOAT, 36, 12], [3, gl.FLOAT, 36, 24]], 1);
+        gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, uncertain);
+        gl.depthMask(true);
+      }
       const size = (N < 60 ? 10 : N < 400 ? 7 : N < 1500 ? 6 : 4) * ratio * (main ? Math.sqrt(S.zoom) : 0.6);
       use("points", {
         ...common, step_: STEP, deep: D.deep / D.reach, size, chosen: S.chosen, near_: colours.near, mid: colours.mid, far_: colours.far,
@@ -275,12 +283,6 @@ const scene = (() => {
       });
       attributes(buffers.points, [[4, gl.SHORT, 8, 8 * frame * N]], 0);
       gl.drawArrays(gl.POINTS, 0, N);
-      if (uncertain) {
-        gl.depthMask(false);
-        use("ellipsoids", { ...common, sigmas: SIGMAS, ink: colours.accent });
-        attributes(buffers.ellipsoids, [[3, gl.FLOAT, 36, 0], [3, gl.FLOAT, 36, 12], [3, gl.FLOAT, 36, 24]], 1);
-        gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, uncertain);
-      }
       if (main) axes(common, bones + path, width, height);
     });
   }
