@@ -18,13 +18,13 @@ const scene = (() => {
     points: [HEAD + `
       layout(location = 0) in vec4 q;
       uniform float step_, size, deep; uniform int chosen; uniform vec3 near_, mid, far_, guess, pick, ground;
-      flat out vec3 colour; flat out float hole, solid;
+      flat out vec3 colour; flat out float hole, solid, soft;
       void main() {
         vec3 v = turned(q.xyz * step_);
         vec4 eye = look * vec4(v, 1.0);
         gl_Position = projection * eye;
         if (q.w < 2.0) gl_Position = vec4(9.0, 9.0, 9.0, 1.0); // not known: off the screen
-        bool seen = mod(q.w, 2.0) > 0.5, mine = gl_VertexID == chosen;
+        bool seen = mod(q.w, 2.0) > 0.5, mine = chosen == 1;
         float z = clamp(-v.z / deep, -1.0, 1.0);
         colour = z < 0.0 ? mix(mid, near_, -z) : mix(mid, far_, z);
         if (!seen) colour = guess;
@@ -34,13 +34,13 @@ const scene = (() => {
         hole = seen || mine ? 0.0 : 0.5;
         solid = seen || mine ? 1.0 : 0.55;
         gl_PointSize = size * (mine ? 2.0 : seen ? 1.0 : 0.85) * (projection[2][3] < 0.0 ? 5.0 / gl_Position.w : 1.0);
+        soft = 2.0 / gl_PointSize; // one pixel
       }`, FRAGMENT + `
-      flat in vec3 colour; flat in float hole, solid;
+      flat in vec3 colour; flat in float hole, solid, soft;
       void main() {
-        float r = length(gl_PointCoord * 2.0 - 1.0), soft = fwidth(r);
-        float a = 1.0 - smoothstep(1.0 - soft, 1.0, r);
-        if (hole > 0.0) a *= smoothstep(hole - soft, hole, r);
-        a *= solid;
+        float r = length(gl_PointCoord * 2.0 - 1.0);
+        float a = solid * clamp((1.0 - r) / soft, 0.0, 1.0);
+        if (hole > 0.0) a *= clamp((r - hole) / soft + 0.5, 0.0, 1.0);
         if (a < 0.05) discard;
         o = vec4(colour * a, a);
       }`],
@@ -277,12 +277,21 @@ const scene = (() => {
         gl.depthMask(true);
       }
       const size = (N < 60 ? 10 : N < 400 ? 7 : N < 1500 ? 6 : 4) * ratio * (main ? Math.sqrt(S.zoom) : 0.6);
-      use("points", {
-        ...common, step_: STEP, deep: D.deep / D.reach, size, chosen: S.chosen, near_: colours.near, mid: colours.mid, far_: colours.far,
+      const looks = {
+        ...common, step_: STEP, deep: D.deep / D.reach, size, near_: colours.near, mid: colours.mid, far_: colours.far,
         guess: colours.guess, pick: colours.pick, ground: colours.stage,
-      });
-      attributes(buffers.points, [[4, gl.SHORT, 8, 8 * frame * N]], 0);
-      gl.drawArrays(gl.POINTS, 0, N);
+      };
+      // A small view has no room for thousands of points: it takes every second, third, ... one.
+      const skip = main ? 1 : Math.ceil(N / 1300);
+      use("points", { ...looks, chosen: 0 });
+      attributes(buffers.points, [[4, gl.SHORT, 8 * skip, 8 * frame * N]], 0);
+      gl.drawArrays(gl.POINTS, 0, Math.floor(N / skip));
+      if (S.chosen >= 0) {
+        gl.disable(gl.DEPTH_TEST);
+        use("points", { ...looks, chosen: 1 });
+        attributes(buffers.points, [[4, gl.SHORT, 8, 8 * (frame * N + S.chosen)]], 0);
+        gl.drawArrays(gl.POINTS, 0, 1);
+      }
       if (main) axes(common, bones + path, width, height);
     });
   }
