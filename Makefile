@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 
-.PHONY: setup table1 test lint kill clean
+.PHONY: setup table1 test lint kill page clean
 
 setup: $(VENV)/.stamp
 
@@ -28,6 +28,10 @@ lint: setup
 
 kill: setup
 	$(BIN)/python -m tests.kill
+
+# The report page in a headless Chromium (Debian: chromium chromium-driver): size, time to load, frame rate, pictures.
+page: setup
+	$(BIN)/python -m eval.page
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache build *.egg-info

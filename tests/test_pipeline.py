@@ -62,6 +62,9 @@ def test_a_film_becomes_a_reconstruction_and_is_not_overwritten(tmp_path, capsys
     assert printed["points"] == tracks.points == rec.points3d.shape[1]
     assert printed["rank"] == rec.rank == tr.estimate_rank(tracks).rank
     assert (out / "views.png").read_bytes()[:4] == b"\x89PNG"
+    page = (out / "report.html").read_text()
+    assert f"torchrecon reconstruct {tmp_path / 'frames'} -o {out} --masks" in page
+    assert '"film":{"every":1' in page
     seen = tracks.visible
     error = (rec.reproject() - tracks.xy)[seen].norm(dim=-1).median()
     assert error < 1.5  # pixels

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ def run(options: argparse.Namespace) -> None:
         torch.empty(0, device=options.device)
     except (RuntimeError, AssertionError) as error:  # a build without that backend fails an assertion inside torch
         raise ReconError(f"--device {options.device}: is not available here ({error})") from error
-    by_name = {f.__name__: f for f in (solve, rank, track, reconstruct, batch, export)}
+    by_name = {f.__name__: f for f in (solve, rank, track, reconstruct, report, batch, export)}
     by_name[options.command](options)
 
 
@@ -85,7 +86,27 @@ def reconstruct(options: argparse.Namespace) -> None:
         force=options.force,
         progress=True,
     )
-    _say(options, _summary(answer) | {"out": options.out})
+    _say(options, _summary(answer) | {"out": options.out, "report": str(Path(options.out) / "report.html")})
+
+
+def report(options: argparse.Namespace) -> None:
+    """``torchrecon report``."""
+    from torchrecon.io.tracks import load_tracks
+    from torchrecon.pipeline.report import write_report
+
+    words = ["torchrecon", "report", options.reconstruction, "-o", options.out]
+    for name in ("tracks", "video"):
+        words += [] if getattr(options, name) is None else [f"--{name}", getattr(options, name)]
+    path = write_report(
+        Reconstruction.load(options.reconstruction),
+        options.out,
+        tracks=None if options.tracks is None else load_tracks(options.tracks),
+        video=options.video,
+        title=None if options.video is not None else Path(options.reconstruction).name,
+        command=shlex.join(words),
+        seed=options.seed,
+    )
+    _say(options, {"bytes": path.stat().st_size, "out": str(path)})
 
 
 def batch(options: argparse.Namespace) -> None:

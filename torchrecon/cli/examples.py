@@ -34,6 +34,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("torchrecon batch clips/ -o results/", "each clip to results/NAME/; run it again to go on"),
         ("torchrecon batch clips/ -o results/ --workers 4 --json", "four processes, the counts as JSON"),
     ),
+    "report": (
+        ("torchrecon report shape.npz -o report.html", "a page that shows it and how far to trust it"),
+        ("torchrecon report shape.npz -o report.html --tracks tracks.npz --video clip.mp4", "with the film beside it"),
+    ),
     "export": (
         ("torchrecon export out/reconstruction.npz -o walk.bvh", "joint angles for Blender"),
         ("torchrecon export out/reconstruction.npz -o walk.trc --height 1.75", "OpenSim, a person of 1.75 m"),

@@ -9,7 +9,6 @@ from torchrecon.cli.examples import EXAMPLES
 
 __all__ = ["build_parser"]
 
-
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = argparse.ArgumentParser(
@@ -59,6 +58,12 @@ def build_parser() -> argparse.ArgumentParser:
     batch.add_argument("--camera", metavar="FILE", help="camera JSON, the same for all")
     batch.add_argument("--config", metavar="FILE", help="YAML with stage parameters (see configs/)")
     batch.add_argument("--force", action="store_true", help="replace the results of a batch with other settings")
+
+    report = _command(commands, "report", "page to look at a reconstruction, one file that works offline")
+    report.add_argument("reconstruction", metavar="RECON.npz")
+    report.add_argument("-o", "--out", required=True, metavar="report.html", help="replaced atomically")
+    report.add_argument("--tracks", metavar="TRACKS.npz", help="the tracks it was made from: gaps, confidence, K")
+    report.add_argument("--video", metavar="VIDEO", help="the clip they were found in")
 
     export = _command(commands, "export", "reconstruction to other programs' formats, chosen by the suffix")
     export.add_argument("reconstruction", metavar="RECON.npz", help="what solve and reconstruct write")

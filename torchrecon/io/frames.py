@@ -22,10 +22,23 @@ from numpy.typing import NDArray
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.errors import ReconError
 
-__all__ = ["CameraFile", "FrameSource", "ImageFolder", "load_camera", "open_depths", "open_frames", "open_masks"]
+__all__ = [
+    "CameraFile",
+    "FrameSource",
+    "ImageFolder",
+    "Stills",
+    "encode_stills",
+    "load_camera",
+    "open_depths",
+    "open_frames",
+    "open_masks",
+]
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 _DEFAULT_FPS = 25.0
+_STILLS = 600  # pictures of a film at most; longer ones are thinned
+# (longest side in pixels, JPEG quality), best first
+_RUNGS = ((720, 70), (640, 65), (640, 50), (560, 45), (480, 45), (400, 40), (320, 40), (320, 25), (240, 20), (160, 15))
 Image = NDArray[np.generic]
 Item = TypeVar("Item", covariant=True)
 
@@ -297,3 +310,77 @@ def load_camera(path: str | os.PathLike[str]) -> CameraFile:
     rotations = [_matrix(c["R"], (3, 3), f"{source}: camera {i} R") for i, c in enumerate(cameras)]
     translations = [_matrix(c["t"], (3,), f"{source}: camera {i} t") for i, c in enumerate(cameras)]
     return CameraFile(each[0], torch.stack(rotations), torch.stack(translations))
+
+
+@dataclass(frozen=True)
+class Stills:
+    """A film as small JPEG images; image ``i`` shows frames ``i * every`` up to the next one.
+
+    Attributes:
+        images: one JPEG file each.
+        every: frames per image.
+        size: (height, width) of the film itself in pixels.
+    """
+
+    images: tuple[bytes, ...]
+    every: int
+    size: tuple[int, int]
+
+
+def encode_stills(frames: FrameSource, budget: int) -> Stills:
+    """Re-encode a film so that its images take at most ``budget`` bytes together.
+
+    Size and quality are the best of a ladder that fits; where the lowest does not, every other image is left out.
+
+    Raises:
+        ReconError: not even one image fits.
+
+    Example:
+        >>> import cv2, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for name in "abc":
+        ...         _ = cv2.imwrite(f"{folder}/{name}.png", np.full((24, 32, 3), 90, np.uint8))
+        ...     stills = encode_stills(open_frames(folder), 10_000)
+        >>> len(stills.images), stills.every, stills.size
+        (3, 1, (24, 32))
+    """
+    every = math.ceil(len(frames) / _STILLS)
+    # The film is decoded once; what is kept of it is small however long it is.
+    kept = [_to_jpeg(_to_bytes(f), *_RUNGS[0]) for i, f in enumerate(frames) if i % every == 0]
+    while True:
+        sample = kept[:: max(1, len(kept) // 8)]
+        for rung in _RUNGS:
+            if sum(len(_again(image, *rung)) for image in sample) * len(kept) > 1.1 * budget * len(sample):
+                continue
+            images = kept if rung == _RUNGS[0] else [_again(image, *rung) for image in kept]
+            if sum(map(len, images)) <= budget:
+                return Stills(tuple(images), every, frames.size)
+        if len(kept) == 1:
+            raise ReconError(f"{frames.path}: not even one small image fits into {budget} bytes; allow a larger page")
+        kept, every = kept[::2], 2 * every
+
+
+def _to_bytes(frame: Float[Tensor, "3 height width"]) -> Image:
+    """BGR, 8 bit, as OpenCV writes it."""
+    return (frame.flip(0).permute(1, 2, 0) * 255).round().to(torch.uint8).contiguous().numpy()
+
+
+def _to_jpeg(image: Image, longest: int, quality: int) -> bytes:
+    import cv2
+
+    shrink = longest / max(image.shape[:2])
+    if shrink < 1:
+        size = (max(1, round(image.shape[1] * shrink)), max(1, round(image.shape[0] * shrink)))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    good, data = cv2.imencode(".jpg", image, options)
+    if not good:
+        raise ReconError(f"an image of shape {image.shape} cannot be encoded as JPEG")
+    return bytes(data)
+
+
+def _again(jpeg: bytes, longest: int, quality: int) -> bytes:
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return _to_jpeg(np.asarray(image), longest, quality)

@@ -135,7 +135,7 @@ def marchenko_pastur_tail(ratio: float, share: float) -> float:
 
     Example:
         >>> round(marchenko_pastur_tail(0.5, 1.0), 2), round(marchenko_pastur_tail(0.5, 0.25), 2)
-        (1.0, 0.21)
+        (1.0, 0.24)
     """
     low, high = (1 - ratio**0.5) ** 2, (1 + ratio**0.5) ** 2
     # x = middle + half * sin(a): the square roots at both edges become smooth in a.

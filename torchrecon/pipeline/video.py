@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,16 +20,18 @@ from torchrecon.errors import ReconError
 from torchrecon.features import track_points
 from torchrecon.io.files import remove_leftovers, write_json
 from torchrecon.io.frames import FrameSource, load_camera, open_depths, open_frames, open_masks
-from torchrecon.measurement import Reconstruction, Solver, Tracks
+from torchrecon.measurement import RankEstimate, Reconstruction, Solver, Tracks
 from torchrecon.pipeline.depth import body_depth, with_depth
 from torchrecon.pipeline.reconstructor import reconstruct
+from torchrecon.pipeline.report import write_report
+from torchrecon.rank import estimate_rank
 from torchrecon.viz.views import draw_views
 
 __all__ = ["reconstruct_video", "track_video"]
 
 Item = TypeVar("Item")
 RUN_FILE = "run.json"
-RESULTS = ("tracks.npz", "reconstruction.npz", "report.json", "views.png")
+RESULTS = ("tracks.npz", "reconstruction.npz", "report.json", "views.png", "report.html")
 
 
 def track_video(
@@ -98,8 +101,8 @@ def reconstruct_video(
     """Everything from a clip to 3D, written to a folder.
 
     The folder holds ``run.json`` (what was run), ``tracks.npz``, ``reconstruction.npz``, ``views.png`` (front, side
-    and top view at three frames) and ``report.json``. Tracks of the same run are taken from the folder again, so a
-    run that was interrupted after tracking goes on from there.
+    and top view at three frames), ``report.json`` and ``report.html`` (all of it to look at, in one file). Tracks of
+    the same run are taken from the folder again, so a run that was interrupted after tracking goes on from there.
 
     Raises:
         ReconError: as :func:`track_video`; a folder that holds another run's results, without ``force``.
@@ -123,7 +126,7 @@ def reconstruct_video(
     else:
         tracks = track_video(video, masks, depth, camera, config, progress)
         tracks.save(tracks_file)
-    answer = reconstruct(tracks.to(device), rank, solver, generator=torch.Generator().manual_seed(seed)).to("cpu")
+    answer, estimate = _solve(tracks.to(device), rank, solver, seed)
     answer.save(folder / "reconstruction.npz")
     write_json(
         folder / "report.json",
@@ -138,7 +141,42 @@ def reconstruct_video(
         },
     )
     draw_views(answer, folder / "views.png")
+    write_report(
+        answer,
+        folder / "report.html",
+        tracks=tracks,
+        video=video,
+        rank=estimate,
+        command=_command(video, out, masks, depth, camera, rank, run["solver"], seed),
+        settings=to_mapping(config),
+    )
     return answer
+
+
+def _solve(
+    tracks: Tracks, rank: int | Literal["auto"], solver: str | Solver, seed: int
+) -> tuple[Reconstruction, RankEstimate]:
+    """What ``reconstruct`` gives, and the evidence for K, estimated once; for a given K it is kept beside it."""
+    generator = torch.Generator().manual_seed(seed)
+    estimate = estimate_rank(tracks, generator=generator)
+    if rank == "auto":
+        answer = reconstruct(tracks, int(estimate.rank), solver, generator=generator)
+        return replace(answer, deformation_degree=estimate.deformation_degree).to("cpu"), estimate
+    return reconstruct(tracks, rank, solver, generator=torch.Generator().manual_seed(seed)).to("cpu"), estimate
+
+
+def _command(
+    video: object, out: object, masks: object, depth: object, camera: object, rank: object, solver: object, seed: int
+) -> str:
+    """The command line that does the same."""
+    options = {"--masks": masks, "--depth": depth, "--camera": camera}
+    options |= {"--rank": rank, "--solver": solver, "--seed": seed}
+    usual = {"--rank": "auto", "--solver": "auto", "--seed": 0}
+    words = ["torchrecon", "reconstruct", str(video), "-o", str(out)]
+    for name, value in options.items():
+        if value is not None and value != usual.get(name):
+            words += [name, str(value)]
+    return shlex.join(words)
 
 
 def _claim(folder: Path, run: Mapping[str, object], force: bool) -> bool:
