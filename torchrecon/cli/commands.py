@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import warnings
 from typing import Any
 
 import torch
@@ -29,10 +30,9 @@ def run(options: argparse.Namespace) -> None:
 
 def solve(options: argparse.Namespace) -> None:
     """``torchrecon solve``."""
-    from torchrecon.io.tracks import load_tracks
     from torchrecon.pipeline.reconstructor import reconstruct as reconstruct_tracks
 
-    tracks = load_tracks(options.tracks).to(options.device)
+    tracks = _load(options)
     if options.camera is not None:
         tracks = _with_camera(tracks, options.camera)
     answer = reconstruct_tracks(tracks, _rank(options.rank), options.solver, generator=_generator(options))
@@ -42,10 +42,9 @@ def solve(options: argparse.Namespace) -> None:
 
 def rank(options: argparse.Namespace) -> None:
     """``torchrecon rank``."""
-    from torchrecon.io.tracks import load_tracks
     from torchrecon.rank import estimate_rank
 
-    tracks = load_tracks(options.tracks).to(options.device)
+    tracks = _load(options)
     estimate = estimate_rank(tracks, options.rule, options.layout, generator=_generator(options))
     fields = {name: plain(getattr(estimate, name)) for name in RankEstimate.__dataclass_fields__}
     if options.out is not None:
@@ -94,6 +93,19 @@ def export(options: argparse.Namespace) -> None:
 
     path = export_reconstruction(Reconstruction.load(options.reconstruction), options.out, options.fps)
     _say(options, {"out": str(path)})
+
+
+def _load(options: argparse.Namespace) -> Tracks:
+    """The tracks file, with what its reader has to say on stderr."""
+    from torchrecon.io.tracks import load_tracks
+
+    size = None if options.image_size is None else tuple(options.image_size)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        tracks = load_tracks(options.tracks, person=options.person, view=options.view, image_size=size, fps=options.fps)
+    for warning in said:
+        print(f"warning: {warning.message}", file=sys.stderr)
+    return tracks.to(options.device)
 
 
 def _config(options: argparse.Namespace) -> Any:
