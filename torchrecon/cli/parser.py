@@ -71,7 +71,7 @@ def _tracks(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "tracks",
         metavar="TRACKS",
-        help="own .npz; CoTracker or TAPIR arrays; OpenPose (also a folder), COCO, MediaPipe, MMPose JSON; Penn Action; "
+        help="own .npz; CoTracker, TAPIR arrays; OpenPose (also a folder), COCO, MediaPipe, MMPose JSON; Penn Action; "
         "DeepLabCut, SLEAP; CSV; with --view C3D, TRC, BVH; told by content",
     )
     command.add_argument("--person", type=int, metavar="N", help="which person (default: 0, the longest and surest)")

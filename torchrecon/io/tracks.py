@@ -64,6 +64,8 @@ def load_tracks(
 
 def _content(source: Source) -> str:
     """What is there instead of a known format."""
+    if source.path.suffix.lower() == ".npz" and source.kind != "npz":
+        return f"is not a readable .npz archive (it holds {source.kind}); write it with numpy.savez"
     if source.kind in ("npz", "mat"):
         return f"has no key 'xy' nor those of another format; keys found: {', '.join(sorted(source.arrays)) or 'none'}"
     if source.kind == "json" and isinstance(source.json, dict):

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -34,10 +34,8 @@ class ReadOptions:
     confidence: ConfidenceParams = field(default_factory=ConfidenceParams)
 
 
-class Read(Protocol):
-    """A reader: a source that its ``sniff`` accepted, to tracks."""
-
-    def __call__(self, source: Source, options: ReadOptions = ..., /) -> Tracks: ...
+Read: TypeAlias = Callable[[Source, ReadOptions], Tracks]
+"""A reader: a source that its ``sniff`` accepted, to tracks."""
 
 
 @dataclass(frozen=True)

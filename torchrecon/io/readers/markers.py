@@ -135,7 +135,8 @@ def read_free_throw(source: Source, options: ReadOptions | None = None) -> Track
     span = float(times[-1] - times[0]) if len(times) == len(rows) else 0.0
     fps = 1000.0 * (len(rows) - 1) / span if 1.0 <= span < 1e9 and len(rows) > 1 else None
     names = tuple(str(name)[:100] for name in joints)
-    return project(source, options or ReadOptions(), 304.8 * feet, "z", fps, names)
+    with np.errstate(over="ignore"):
+        return project(source, options or ReadOptions(), 304.8 * feet, "z", fps, names)
 
 
 def _begins(source: Source, word: bytes) -> bool:
