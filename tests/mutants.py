@@ -196,7 +196,8 @@ def _hdf5(data: bytes, rng: random.Random) -> bytes:
         elif kind == 3:
             file[name] = h5py.SoftLink("/" + rng.choice(sets))
         elif kind == 4 and old.dtype.kind == "f":
-            file[name] = _array(old, random.Random(rng.randrange(5)))
+            bad = _array(old, rng)
+            file[name] = bad if bad.dtype.kind in "fiubc" else old.reshape(-1)
         elif kind == 4:
             file[name] = old.reshape(-1)[: rng.randrange(old.size + 1)]
         if kind in (1, 4):

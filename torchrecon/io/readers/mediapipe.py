@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrecon.io.readers.base import Format, ReadOptions, build, frame_numbers, pixels
+from torchrecon.io.readers.base import FARTHEST, Format, ReadOptions, build, frame_numbers, pixels
 from torchrecon.io.readers.layouts import MEDIAPIPE_33
 from torchrecon.io.readers.people import Detection, choose, follow
 from torchrecon.io.readers.source import Source, numbers
@@ -87,7 +87,7 @@ def _size(content: Any) -> tuple[float, float] | None:
     if isinstance(content, dict):
         for height, width in (("image_height", "image_width"), ("height", "width")):
             found = (content.get(height), content.get(width))
-            if all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in found):
+            if all(isinstance(x, (int, float)) and 0 < x < FARTHEST for x in found):
                 return float(found[0] or 0), float(found[1] or 0)
     return None
 
