@@ -39,8 +39,8 @@ def load_tracks(
         confidence: parameters of the rule.
 
     Returns:
-        Tracks in the default floating-point type (own files keep theirs); frames without an entry have no visible
-        point.
+        Tracks in float64 (own files keep their type): a file of keypoints is small, and normal equations of nearly
+        noise-free points are not positive definite in float32. Frames without an entry have no visible point.
 
     Raises:
         ReconError: no such file, an unknown or damaged format, no such person, 3D positions without a view; names

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -14,7 +14,7 @@ import torch
 from torchrecon.errors import ReconError
 from torchrecon.io.readers.confidence import ConfidenceParams, visible_and_covariance
 from torchrecon.io.readers.layouts import Layout
-from torchrecon.io.readers.source import MAX_BYTES, Floats, Source
+from torchrecon.io.readers.source import MAX_NUMBERS, Floats, Source
 from torchrecon.measurement import Tracks
 
 __all__ = ["FARTHEST", "Format", "Read", "ReadOptions", "build", "frame_numbers", "pixels", "warn"]
@@ -67,7 +67,6 @@ def build(
     layout: Layout | None = None,
     body: bool = True,
     fps: float | None = None,
-    extras: Mapping[str, Floats] | None = None,
 ) -> Tracks:
     """Tracks from positions and confidence, by the one rule of :class:`ConfidenceParams`.
 
@@ -79,14 +78,13 @@ def build(
         layout: names and edges of the points; left out where the number of points is another.
         body: whether the points are keypoints of one body, or those of a point tracker.
         fps: frames per second, where the file states it.
-        extras: by name, (*batch, frames, points).
 
     Raises:
         ReconError: positions that no image has, nothing visible.
     """
     if xy.ndim < 3 or 0 in xy.shape:
         raise source.error(f"holds no points (shape {xy.shape})")
-    if xy.nbytes > MAX_BYTES:
+    if xy.size > MAX_NUMBERS:
         raise source.error(f"{xy.shape} positions are more than are read at once; cut the clip into pieces")
     xy = np.where(np.isfinite(xy).all(-1, keepdims=True), xy, np.nan)
     c = np.ones(xy.shape[:-1]) if confidence is None else np.nan_to_num(confidence, nan=0.0, posinf=0.0, neginf=0.0)
@@ -98,16 +96,14 @@ def build(
     if not visible.any():
         raise source.error("no point is visible in any frame; every confidence is at or below the floor")
     known = layout is not None and len(layout.names) == xy.shape[-2]
-    dtype = torch.get_default_dtype()
     try:
         return Tracks(
-            torch.from_numpy(xy).to(dtype),
+            torch.from_numpy(xy),
             torch.from_numpy(visible),
-            None if covariance is None else torch.from_numpy(covariance).to(dtype),
+            None if covariance is None else torch.from_numpy(covariance),
             fps=options.fps or fps or 25.0,
             names=layout.names if layout is not None and known else None,
             edges=(layout.edges or None) if layout is not None and known else None,
-            extras=None if extras is None else {k: torch.from_numpy(v).to(dtype) for k, v in extras.items()},
         )
     except ReconError as error:
         raise source.error(str(error)) from error

@@ -14,7 +14,7 @@ import numpy as np
 
 from torchrecon.io.readers.base import FARTHEST, ReadOptions, warn
 from torchrecon.io.readers.confidence import body_size
-from torchrecon.io.readers.source import MAX_BYTES, Floats, Source
+from torchrecon.io.readers.source import MAX_NUMBERS, Floats, Source
 
 __all__ = ["Detection", "FollowParams", "Person", "choose", "follow"]
 
@@ -67,7 +67,7 @@ class Person:
     def arrays(self, source: Source, frames: int) -> tuple[Floats, Floats]:
         """(frames, points, 2) with NaN, and (frames, points) with zero, where there is no detection."""
         points = len(next(iter(self.seen.values())).xy)
-        if frames * points * 16 > MAX_BYTES:
+        if frames * points * 2 > MAX_NUMBERS:
             raise source.error(f"{frames} frames of {points} points are more than are read at once")
         xy, confidence = np.full((frames, points, 2), np.nan), np.zeros((frames, points))
         for frame, detection in self.seen.items():

@@ -17,7 +17,7 @@ from torchrecon.io.readers.base import Format, ReadOptions, build, frame_numbers
 from torchrecon.io.readers.layouts import Layout
 from torchrecon.io.readers.markers import project
 from torchrecon.io.readers.people import Detection, Person, choose
-from torchrecon.io.readers.source import MAX_BYTES, Floats, Source
+from torchrecon.io.readers.source import MAX_NUMBERS, Floats, Source
 from torchrecon.io.readers.table import cell_number, table_rows
 from torchrecon.measurement import Tracks
 
@@ -102,7 +102,7 @@ def _read_long(source: Source, options: ReadOptions, head: Sequence[str]) -> Tra
     _, count = frame_numbers(source, numbered)
     first = min(numbered)
     layout = Layout(tuple(points))
-    if count * len(points) * 16 > MAX_BYTES:
+    if count * len(points) * 2 > MAX_NUMBERS:
         raise source.error(f"{count} frames of {len(points)} points are more than are read at once")
     if len(axes) == 3:
         if len(people) > 1:
@@ -147,7 +147,7 @@ def _read_wide(source: Source, options: ReadOptions, head: Sequence[str]) -> Tra
     if len(set(numbered)) < len(numbered):
         raise source.error("two rows have one frame number")
     places, count = frame_numbers(source, numbered)
-    if count * len(wanted) * 8 > MAX_BYTES:
+    if count * len(wanted) > 2 * MAX_NUMBERS:
         raise source.error(f"{count} frames of {len(points)} points are more than are read at once")
     table = np.full((count, len(points), 4), np.nan)
     table[places] = np.array(rows).reshape(len(rows), len(points), 4)

@@ -25,9 +25,10 @@ from torchrecon.errors import ReconError
 from torchrecon.io.readers.matfile import read_mat
 from torchrecon.measurement._store import read_archive, read_array
 
-__all__ = ["MAX_BYTES", "MAX_TEXT", "Floats", "Source", "numbers"]
+__all__ = ["MAX_BYTES", "MAX_NUMBERS", "MAX_TEXT", "Floats", "Source", "numbers"]
 
 MAX_BYTES = 1 << 28  # 256 MiB of file, or of arrays once decompressed
+MAX_NUMBERS = 1 << 23  # in one table, in double precision and with the copies that checking makes
 MAX_TEXT = 1 << 26  # 64 MiB of text: Python objects take several times the room of the text that makes them
 _MAX_NODES = 4_000_000  # containers and keys of a JSON text, some 100 bytes each
 _MAX_FILES = 200_000  # of a folder
@@ -207,10 +208,14 @@ def numbers(source: Source, value: Any, what: str, columns: int | None = None) -
     """
     try:
         array = np.asarray(value)
+        if array.size > 2 * MAX_NUMBERS:
+            raise source.error(f"{what}: {array.size} numbers are more than are read at once; cut the clip into pieces")
         if array.dtype.kind not in "biufO" and array.size:
             raise ValueError(f"it holds {array.dtype}")
         array = array.astype(np.float64)
     except (TypeError, ValueError, OverflowError) as error:
+        if isinstance(error, ReconError):
+            raise
         raise source.error(f"{what}: is not a table of numbers ({error})") from error
     if columns is not None and array.shape[-1:] != (columns,):
         raise source.error(f"{what}: shape {array.shape}; {columns} numbers per entry are needed")
