@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from itertools import pairwise
 
+import h5py
 import numpy as np
 import pytest
 
@@ -174,6 +175,31 @@ def test_shares_of_the_image_need_its_size(tmp_path):
     assert "a square of 1000 pixels is assumed" in said[0]
     np.savez(tmp_path / "t.npz", tracks=walk(6) / [640, 480])
     check(load(tmp_path / "t.npz", image_size=(480, 640))[0], walk(6))
+
+
+def test_a_folder_with_one_file_a_frame_counts_by_their_names(tmp_path):
+    folder = tmp_path / "predictions"
+    folder.mkdir()
+    xy, sure = walk(17), scores(17)
+    for t in (0, 1, 2, 10):
+        instance = {"keypoints": xy[t].tolist(), "keypoint_scores": sure[t].tolist()}
+        (folder / f"img_{t}.json").write_text(json.dumps([instance]))
+    tracks, _ = load(folder)
+    assert tracks.visible.any(-1).tolist() == [t in (0, 1, 2, 10) for t in range(11)]
+    np.testing.assert_allclose(tracks.xy[10].numpy()[sure[10] > 0.1], xy[10][sure[10] > 0.1])
+
+
+def test_sleap_in_either_axis_order(tmp_path):
+    path = files.sleap_h5(tmp_path)
+    with h5py.File(path, "r+") as file:
+        for name in ("tracks", "point_scores"):
+            value = file[name][()].T
+            del file[name]
+            file[name] = value
+    tracks, _ = load(path)
+    check(tracks, walk(5), scores(5))
+    assert tracks.edges == ((0, 1), (1, 2))
+    assert tracks.names == ("n0", "n1", "n2", "n3", "n4")
 
 
 def test_frames_keep_their_gaps_and_their_rate(tmp_path):

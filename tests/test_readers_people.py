@@ -109,6 +109,14 @@ def test_a_short_gap_is_bridged_and_a_stranger_is_not_joined(tmp_path):
     assert [len(person.seen) for person in people] == [24, 10]
 
 
+def test_there_is_no_second_person_where_nothing_tells_people_apart(tmp_path):
+    for write in (files.tracks_npz, files.cotracker, files.tapir, files.penn_action, files.long_csv, files.wide_csv):
+        path = write(tmp_path)
+        assert load(path, person=0)[0].frames == 12
+        with pytest.raises(tr.ReconError, match="person 1 is not there"):
+            tr.load_tracks(path, person=1)
+
+
 def test_humaneva_recordings_are_chosen_by_number(tmp_path):
     path = files.humaneva(tmp_path)
     tracks, said = load(path)

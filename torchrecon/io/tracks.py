@@ -23,10 +23,10 @@ def load_tracks(
     """Read tracks; the format is told from the content, not from the name.
 
     Known are: the project's own .npz (arrays named as the fields of :class:`torchrecon.Tracks`), CoTracker, TAPIR and
-    TAPNext arrays (.npz, .npy), OpenPose JSON (file, or folder with one file a frame), COCO keypoint JSON, MediaPipe
-    landmarks JSON, MMPose and rtmlib output, Penn Action .mat, DeepLabCut and SLEAP CSV and H5, HumanEva collections,
-    long and wide CSV, each also gzipped. C3D, TRC, BVH and free-throw JSON hold 3D positions: they become tracks only
-    with ``view``. Confidence becomes visibility and covariance by the one rule of
+    TAPNext arrays (.npz, .npy), OpenPose, MediaPipe, MMPose and rtmlib JSON (a file, or a folder with one a frame),
+    rtmlib .npz, COCO keypoint JSON, Penn Action .mat, DeepLabCut and SLEAP CSV and H5, HumanEva collections, long and
+    wide CSV, each also gzipped. C3D, TRC, BVH and free-throw JSON hold 3D positions: they become tracks only with
+    ``view``. Confidence becomes visibility and covariance by the one rule of
     :class:`torchrecon.io.readers.ConfidenceParams`.
 
     Args:

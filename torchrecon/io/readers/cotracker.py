@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrecon.io.readers.base import Format, ReadOptions, build
+from torchrecon.io.readers.people import alone
 from torchrecon.io.readers.source import Floats, Source, numbers
 from torchrecon.measurement import Tracks
 
@@ -37,6 +38,8 @@ def read_cotracker(source: Source, options: ReadOptions | None = None) -> Tracks
     Raises:
         ReconError: shapes that are not as above.
     """
+    options = options or ReadOptions()
+    alone(source, options)
     xy = numbers(source, source.arrays["pred_tracks"], "pred_tracks", columns=2)
     if xy.ndim not in (3, 4) or 0 in xy.shape:
         raise source.error(f"pred_tracks: shape {xy.shape}; (batch, frames, points, 2) is needed")
@@ -45,7 +48,7 @@ def read_cotracker(source: Source, options: ReadOptions | None = None) -> Tracks
         confidence = probability(source, source.arrays["pred_visibility"], "pred_visibility", xy.shape[:-1])
     if xy.ndim == 4 and len(xy) == 1:
         xy, confidence = xy[0], None if confidence is None else confidence[0]
-    return build(source, options or ReadOptions(), xy, confidence, body=False)
+    return build(source, options, xy, confidence, body=False)
 
 
 COTRACKER = Format("CoTracker", _sniff, read_cotracker)

@@ -13,6 +13,7 @@ import numpy as np
 from torchrecon.data import Markers, read_bvh, read_c3d, read_trc
 from torchrecon.io.readers.base import Format, ReadOptions, build
 from torchrecon.io.readers.layouts import Layout
+from torchrecon.io.readers.people import alone
 from torchrecon.io.readers.source import Floats, Source, numbers
 from torchrecon.measurement import Tracks
 
@@ -63,6 +64,7 @@ def project(
     Raises:
         ReconError: no view was asked for, or an unknown one.
     """
+    alone(source, options)
     if options.view is None:
         raise source.error(
             f"holds 3D positions already ({positions.shape[1]} points, {positions.shape[0]} frames), so there is "

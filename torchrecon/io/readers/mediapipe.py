@@ -1,9 +1,9 @@
 """MediaPipe landmarks as JSON: per frame a list of landmarks with x, y as shares of the image and a visibility.
 
-There is no official file; accepted are the shapes that dumps of its results take: a list of frames, or an object with
-``frames``; a frame is a list of landmarks, a list of such lists (people), or an object with ``pose_landmarks`` or
-``landmarks``; a landmark is an object with x, y[, z, visibility] or a list of these numbers. z is not read: it is a
-guess of the detector's, not an observation.
+There is no official file; accepted are the shapes that dumps of its results take: a list of frames, an object with
+``frames``, or a folder with one file a frame; a frame is a list of landmarks, a list of such lists (people), or an
+object with ``pose_landmarks`` or ``landmarks``; a landmark is an object with x, y[, z, visibility] or a list of these
+numbers. z is not read: it is a guess of the detector's, not an observation.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _frames(content: Any) -> list[Any]:
 
 
 def _sniff(source: Source) -> bool:
-    if source.kind != "json":
+    if not source.is_json:
         return False
     for frame in _frames(source.json)[:1000]:
         keyed = isinstance(frame, dict) and any(key in frame for key in _KEYS)
@@ -103,7 +103,8 @@ def read_mediapipe(source: Source, options: ReadOptions | None = None) -> Tracks
     options = options or ReadOptions()
     content = source.json
     frames = _frames(content)
-    where, count = frame_numbers(source, [_number(source, frame, i) for i, frame in enumerate(frames)])
+    listed = zip(source.numbering(len(frames)), frames, strict=True)
+    where, count = frame_numbers(source, [_number(source, frame, i) for i, frame in listed])
     found: dict[int, list[Detection]] = {}
     for index, (place, frame) in enumerate(zip(where, frames, strict=True)):
         people = _people(frame)

@@ -1,4 +1,4 @@
-"""MMPose and rtmlib: keypoints with scores, per frame and person, as JSON or npz.
+"""MMPose and rtmlib: keypoints with scores per frame and person, as npz or JSON (also a folder with one file a frame).
 
 Sources: MMPose inferencer output (``instance_info[].instances[]`` with ``keypoints`` and ``keypoint_scores``); rtmlib
 returns ``keypoints`` (people, points, 2) and ``scores`` (people, points) per frame.
@@ -43,9 +43,9 @@ def _frames(content: Any) -> Any:
 def _sniff(source: Source) -> bool:
     if source.kind == "npz":
         return "keypoints" in source.arrays and any(key in source.arrays for key in _SCORES)
-    if source.kind != "json":
-        return False
-    return any(any(map(_is_instance, (_instances(f) or [])[:10])) for f in _frames(source.json)[:1000])
+    return source.is_json and any(
+        any(map(_is_instance, (_instances(f) or [])[:10])) for f in _frames(source.json)[:1000]
+    )
 
 
 def _bodies(source: Source, xy: Floats, scores: Floats, what: str) -> list[Detection]:
@@ -75,11 +75,12 @@ def _instance(source: Source, value: Any, what: str) -> list[Detection]:
 def _from_json(source: Source) -> tuple[list[int], list[list[Detection]], Layout | None]:
     content = source.json
     numbered, found = [], []
-    for index, frame in enumerate(_frames(content)):
+    frames = _frames(content)
+    for index, (place, frame) in enumerate(zip(source.numbering(len(frames)), frames, strict=True)):
         instances = _instances(frame)
         if instances is None:
             raise source.error(f"frame {index}: has no instances")
-        number = frame.get("frame_id", frame.get("frame", index)) if isinstance(frame, dict) else index
+        number = frame.get("frame_id", frame.get("frame", place)) if isinstance(frame, dict) else place
         if not isinstance(number, int):
             raise source.error(f"frame {index}: frame_id {str(number)[:40]!r} is no integer")
         numbered.append(number)

@@ -6,8 +6,6 @@ BODY_25 or COCO-18; hands and faces are not read.
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
 from typing import Any
 
 from torchrecon.io.readers.base import Format, ReadOptions, build, frame_numbers
@@ -27,11 +25,7 @@ def _is_frame(value: Any) -> bool:
 
 
 def _sniff(source: Source) -> bool:
-    if source.kind == "folder":
-        return bool(source.files(".json"))
-    if source.kind != "json":
-        return False
-    content = source.json
+    content = source.json if source.is_json else None
     return _is_frame(content) or (isinstance(content, list) and any(_is_frame(frame) for frame in content[:100]))
 
 
@@ -57,30 +51,6 @@ def _people(source: Source, frame: Any, what: str) -> list[Detection]:
     return found
 
 
-def _folder(source: Source) -> tuple[list[int], list[Any]]:
-    """Frame number, from the file's name, and content of every JSON file."""
-    files = source.files(".json")
-    numbered = [_number(path) for path in files]
-    if None in numbered or len(set(numbered)) < len(files):
-        numbered = list(range(len(files)))
-    contents, left = [], 1 << 28
-    for path in files:
-        each = Source(path)
-        left -= len(each.data)
-        if left < 0:
-            raise source.error("its files are more than is read at once; cut the clip into pieces")
-        if each.kind != "json":
-            raise each.error("is not JSON; a folder of OpenPose output holds one JSON file a frame")
-        contents.append(each.json)
-    return [n for n in numbered if n is not None], contents
-
-
-def _number(path: Path) -> int | None:
-    """The last number in the name: ``clip_000000000012_keypoints.json`` is frame 12."""
-    found = re.findall(r"[0-9]+", re.sub(r"_keypoints$", "", path.stem))
-    return int(found[-1][:15]) if found else None
-
-
 def read_openpose(source: Source, options: ReadOptions | None = None) -> Tracks:
     """Body keypoints of OpenPose; people are followed through the frames.
 
@@ -88,12 +58,8 @@ def read_openpose(source: Source, options: ReadOptions | None = None) -> Tracks:
         ReconError: no people, mixed keypoint sets, a frame that is not OpenPose's.
     """
     options = options or ReadOptions()
-    if source.kind == "folder":
-        numbered, contents = _folder(source)
-    else:
-        contents = source.json if isinstance(source.json, list) else [source.json]
-        numbered = list(range(len(contents)))
-    index, count = frame_numbers(source, numbered)
+    contents = source.json if isinstance(source.json, list) else [source.json]
+    index, count = frame_numbers(source, source.numbering(len(contents)))
     frames: dict[int, list[Detection]] = {}
     for number, frame in zip(index, contents, strict=True):
         frames[number] = _people(source, frame, f"frame {number}")

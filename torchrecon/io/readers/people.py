@@ -16,7 +16,7 @@ from torchrecon.io.readers.base import FARTHEST, ReadOptions, warn
 from torchrecon.io.readers.confidence import body_size
 from torchrecon.io.readers.source import MAX_NUMBERS, Floats, Source
 
-__all__ = ["Detection", "FollowParams", "Person", "choose", "follow"]
+__all__ = ["Detection", "FollowParams", "Person", "alone", "choose", "follow"]
 
 _MOST_PEOPLE = 100  # in one frame
 
@@ -28,13 +28,15 @@ class FollowParams:
     Attributes:
         reach: largest median joint distance to the prediction, body sizes, from one frame to the next.
         spread: growth of that distance per further frame of a gap, body sizes.
-        gap: longest gap, frames; also never longer than the person was seen before.
+        gap: longest gap, frames.
+        patience: a gap is at most this many frames longer than the person was seen before it, frames.
         smoothing: weight of the newest step in the velocity (no unit).
     """
 
     reach: float = 0.25
     spread: float = 0.05
     gap: int = 30
+    patience: int = 5
     smoothing: float = 0.5
 
 
@@ -138,6 +140,12 @@ def follow(
     return sorted(people, key=lambda person: -person.evidence)
 
 
+def alone(source: Source, options: ReadOptions) -> None:
+    """Refuse to choose where there is nothing to choose from."""
+    if options.person not in (None, 0):
+        raise source.error(f"person {options.person} is not there: the file holds one set of points")
+
+
 def choose(source: Source, options: ReadOptions, people: Sequence[Person], what: str = "people") -> Person:
     """The person that ``options`` names, or the first, with a word about it where there are several.
 
@@ -190,7 +198,7 @@ def _associate(frames: Mapping[int, Sequence[Detection]], p: FollowParams) -> li
     people: list[_Followed] = []
     active: list[_Followed] = []
     for frame, found in frames.items():
-        active = [a for a in active if frame - a.last <= min(p.gap, len(a.seen)) + 1]
+        active = [a for a in active if frame - a.last - 1 <= min(p.gap, len(a.seen) + p.patience)]
         free = list(range(len(found)))
         if active and found:
             cost = _costs(active, found, frame, p)

@@ -3,7 +3,7 @@
 Long: ``frame``, ``point`` (or track, keypoint, joint, marker, bodypart, name), ``x``, ``y`` and optionally
 ``confidence`` (or likelihood, score, visibility) and ``person``. Wide: ``NAME_x``, ``NAME_y`` and optionally
 ``NAME_confidence`` and ``frame``; separators ``_ . - :`` and space, or none before a bare number (``x0, y0``).
-A column z makes it 3D.
+A column z makes it 3D (see markers): its numbers are taken as millimetres with y up.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from torchrecon.io.readers.base import Format, ReadOptions, build, frame_numbers
 from torchrecon.io.readers.layouts import Layout
 from torchrecon.io.readers.markers import project
-from torchrecon.io.readers.people import Detection, Person, choose
+from torchrecon.io.readers.people import Detection, Person, alone, choose
 from torchrecon.io.readers.source import MAX_NUMBERS, Floats, Source
 from torchrecon.io.readers.table import cell_number, table_rows
 from torchrecon.measurement import Tracks
@@ -110,6 +110,7 @@ def _read_long(source: Source, options: ReadOptions, head: Sequence[str]) -> Tra
         table = _one(people.popitem()[1], first, count, layout)
         return project(source, options, table[..., :3], "y", names=layout.names)
     if person_at is None:
+        alone(source, options)
         table = _one(people[""], first, count, layout)
         return build(source, options, table[..., :2], table[..., 2], layout=layout)
     bodies = [_person(who, _one(rows, first, count, layout)) for who, rows in people.items()]
@@ -134,6 +135,7 @@ def _person(name: str, table: Floats) -> Person:
 
 
 def _read_wide(source: Source, options: ReadOptions, head: Sequence[str]) -> Tracks:
+    alone(source, options)
     points = _wide(head)
     frame_at = _find(head, _FRAME)
     solid = all("z" in columns for columns in points.values())

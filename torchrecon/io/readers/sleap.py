@@ -44,6 +44,8 @@ def read_sleap_h5(source: Source, options: ReadOptions | None = None) -> Tracks:
         scores = (
             numbers(source, source.dataset(file, "point_scores"), "point_scores") if "point_scores" in file else None
         )
+    if tracks.ndim == 4 and tracks.shape[1] != 2 == tracks.shape[2]:  # some versions write the axes the other way
+        tracks, scores = tracks.T, None if scores is None else scores.T
     if tracks.ndim != 4 or tracks.shape[1] != 2:
         raise source.error(f"tracks: shape {tracks.shape}; (individuals, 2, nodes, frames) is needed")
     xy = tracks.transpose(0, 3, 2, 1)

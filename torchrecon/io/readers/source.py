@@ -90,6 +90,11 @@ class Source:
             raise self.error("unzip it first; files of this format are read as they stand")
         return self.path
 
+    @property
+    def is_json(self) -> bool:
+        """Whether there is something to ask ``json`` for."""
+        return self.kind == "json" or bool(self.files)
+
     def error(self, message: str) -> ReconError:
         """An error that names this input."""
         return ReconError(f"{self.path}: {message}")
@@ -134,7 +139,9 @@ class Source:
 
     @functools.cached_property
     def json(self) -> Any:
-        """The parsed JSON; NaN and Infinity are taken as numbers."""
+        """The parsed JSON, of a folder the list of that of its files; NaN and Infinity are taken as numbers."""
+        if self.kind == "folder":
+            return self._folder_json()
         text = self.text
         if text.count("[") + text.count("{") + text.count(":") > _MAX_NODES:
             raise self.error(f"more than {_MAX_NODES} JSON containers and keys; cut the clip into pieces")
@@ -183,15 +190,40 @@ class Source:
             raise self.error(f"{name}: {size} bytes are more than the {MAX_BYTES} that are read; cut the clip")
         return np.asarray(found[()])
 
-    def files(self, suffix: str) -> list[Path]:
-        """Files of a folder with that suffix, frame2 before frame10."""
+    @functools.cached_property
+    def files(self) -> tuple[Path, ...]:
+        """JSON files of a folder, frame2 before frame10; none for a file."""
+        if self.kind != "folder":
+            return ()
         try:
-            found = [p for p in self.path.iterdir() if p.suffix.lower() == suffix and p.is_file()]
+            found = [p for p in self.path.iterdir() if p.suffix.lower() == ".json" and p.is_file()]
         except OSError as error:
             raise self.error(f"the folder cannot be read ({error})") from error
         if len(found) > _MAX_FILES:
             raise self.error(f"{len(found)} files are more than the {_MAX_FILES} that are read")
-        return sorted(found, key=lambda p: [int(x) if x.isdigit() else x for x in re.split(r"([0-9]+)", p.name[:200])])
+        split = {p: re.split(r"([0-9]+)", p.name) for p in found}
+        return tuple(sorted(found, key=lambda p: [int(x) if x.isdecimal() else x for x in split[p]]))
+
+    def _folder_json(self) -> list[Any]:
+        contents, left = [], MAX_TEXT
+        for path in self.files:
+            each = Source(path)
+            if each.kind != "json":
+                raise each.error("is not JSON; a folder of keypoints holds one JSON file a frame")
+            left -= len(each.data)
+            if left < 0:
+                raise self.error(f"its files are larger than {MAX_TEXT} bytes; cut the clip into pieces")
+            contents.append(each.json)
+        return contents
+
+    def numbering(self, count: int) -> list[int]:
+        """Frame numbers of the entries of a JSON list: of a folder those in the names of its files, if they differ.
+
+        The last number counts: ``clip_000000000012_keypoints.json`` is frame 12.
+        """
+        found = [re.findall(r"[0-9]+", path.stem) for path in self.files]
+        named = [int(digits[-1][:15]) for digits in found if digits]
+        return named if len(set(named)) == len(found) == count else list(range(count))
 
 
 def numbers(source: Source, value: Any, what: str, columns: int | None = None) -> Floats:

@@ -14,6 +14,7 @@ import numpy as np
 
 from torchrecon.io.readers.base import Format, ReadOptions, build, pixels, warn
 from torchrecon.io.readers.cotracker import probability
+from torchrecon.io.readers.people import alone
 from torchrecon.io.readers.source import Floats, Source, numbers
 from torchrecon.measurement import Tracks
 
@@ -88,6 +89,7 @@ def read_tapir(source: Source, options: ReadOptions | None = None) -> Tracks:
         ReconError: shapes that do not fit one another.
     """
     options = options or ReadOptions()
+    alone(source, options)
     name = next(key for key in _TRACKS if key in source.arrays)
     xy = numbers(source, source.arrays[name], name or "array", columns=2)
     if xy.ndim not in (3, 4) or 0 in xy.shape:

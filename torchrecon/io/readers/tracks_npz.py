@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from torchrecon.io.readers.base import Format, ReadOptions
+from torchrecon.io.readers.people import alone
 from torchrecon.io.readers.source import Source
 from torchrecon.measurement import Tracks
 
@@ -17,8 +18,10 @@ def _sniff(source: Source) -> bool:
 
 def read_tracks_npz(source: Source, options: ReadOptions | None = None) -> Tracks:
     """What :meth:`torchrecon.Tracks.save` writes; raises ReconError that names file and key."""
+    options = options or ReadOptions()
+    alone(source, options)
     tracks = Tracks.from_arrays(source.arrays, source.path)
-    if options is None or options.fps is None:
+    if options.fps is None:
         return tracks
     return replace(tracks, fps=options.fps, times=tracks.times * (tracks.fps / options.fps))
 
