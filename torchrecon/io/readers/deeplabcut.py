@@ -19,7 +19,7 @@ from torchrecon.io.readers.layouts import Layout
 from torchrecon.io.readers.markers import project
 from torchrecon.io.readers.people import Detection, Person, choose
 from torchrecon.io.readers.source import Floats, Source
-from torchrecon.io.readers.table import cell_number, table_rows
+from torchrecon.io.readers.table import row_numbers, table_rows
 from torchrecon.measurement import Tracks
 
 __all__ = ["DEEPLABCUT_CSV", "DEEPLABCUT_H5", "literal_pickle", "read_deeplabcut_csv", "read_deeplabcut_h5"]
@@ -51,7 +51,7 @@ def read_deeplabcut_csv(source: Source, options: ReadOptions | None = None) -> T
                 raise source.error("its first four rows are not scorer, [individuals,] bodyparts and coords")
             continue
         labels.append(row[index - 1] if len(row) >= index else "")
-        values.append(np.array([cell_number(source, row, i, number) for i in range(index, len(head["coords"]))]))
+        values.append(np.array(row_numbers(source, row, range(index, len(head["coords"])), number)))
     if not {"bodyparts", "coords"} <= head.keys() or not values:
         raise source.error("has no header rows bodyparts and coords, or no row after them")
     parts, coords = head["bodyparts"], head["coords"]

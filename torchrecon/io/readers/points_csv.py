@@ -9,7 +9,8 @@ A column z makes it 3D (see markers): its numbers are taken as millimetres with 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from torchrecon.io.readers.layouts import Layout
 from torchrecon.io.readers.markers import project
 from torchrecon.io.readers.people import Detection, Person, alone, choose
 from torchrecon.io.readers.source import MAX_NUMBERS, Floats, Source
-from torchrecon.io.readers.table import cell_number, table_rows
+from torchrecon.io.readers.table import cell_number, row_numbers, table_rows
 from torchrecon.measurement import Tracks
 
 __all__ = ["POINTS_CSV", "read_points_csv"]
@@ -80,40 +81,41 @@ def _frame(source: Source, row: list[str], column: int, number: int) -> int:
 
 
 def _read_long(source: Source, options: ReadOptions, head: Sequence[str]) -> Tracks:
-    frame_at, point_at = _find(head, _FRAME), _find(head, _POINT)
-    person_at, sure_at = _find(head, _PERSON), _find(head, _CONFIDENCE)
+    frame_at, point_at, who_at = (_find(head, names) for names in (_FRAME, _POINT, _PERSON))
     axes = [head.index(axis) for axis in "xyz" if axis in head]
+    sure_at = _find(head, _CONFIDENCE)
     points: dict[str, int] = {}
-    people: dict[str, dict[tuple[int, int], list[float]]] = {}
-    numbered: list[int] = []
+    people: dict[str, int] = {}
+    # Typed arrays: a long file has millions of rows, and Python objects take ten times the room.
+    keys, values = array("q"), array("d")
     for number, row in enumerate(table_rows(source), 1):
         if number == 1:
             continue
-        frame = _frame(source, row, frame_at or 0, number)
-        name = row[point_at] if point_at is not None and point_at < len(row) else ""
-        point = points.setdefault(name[:100], len(points))
-        who = row[person_at][:100] if person_at is not None and person_at < len(row) else ""
-        rows = people.setdefault(who, {})
-        if (frame, point) in rows:
-            raise source.error(f"row {number}: point {name[:40]!r} stands twice in frame {frame}")
-        sure = 1.0 if sure_at is None else cell_number(source, row, sure_at, number)
-        rows[frame, point] = [*(cell_number(source, row, a, number) for a in axes), sure]
-        numbered.append(frame)
-    _, count = frame_numbers(source, numbered)
-    first = min(numbered)
+        name, who = (row[at][:100] if at is not None and at < len(row) else "" for at in (point_at, who_at))
+        keys.append(people.setdefault(who, len(people)))
+        keys.append(_frame(source, row, frame_at or 0, number))
+        keys.append(points.setdefault(name, len(points)))
+        values.extend(row_numbers(source, row, [*axes, sure_at], number))
+    person, frame, point = np.array(keys, dtype=np.int64).reshape(-1, 3).T
+    _, count = frame_numbers(source, frame.tolist())
+    if len(people) * count * len(points) * 2 > MAX_NUMBERS:
+        raise source.error(f"{count} frames of {len(points)} points are more than are read at once; cut the clip")
+    place = (person, frame - frame.min(), point)
+    found = np.array(values).reshape(-1, len(axes) + 1)
+    _check_single(source, np.ravel_multi_index(place, (len(people), count, len(points))))
+    table = np.full((len(people), count, len(points), len(axes)), np.nan)
+    table[place] = found[:, :-1]
+    sure = np.zeros(table.shape[:-1])
+    sure[place] = found[:, -1] if sure_at is not None else 1.0
     layout = Layout(tuple(points))
-    if count * len(points) * 2 > MAX_NUMBERS:
-        raise source.error(f"{count} frames of {len(points)} points are more than are read at once")
     if len(axes) == 3:
         if len(people) > 1:
             raise source.error(f"holds 3D positions of {len(people)} people; keep the rows of one")
-        table = _one(people.popitem()[1], first, count, layout)
-        return project(source, options, table[..., :3], "y", names=layout.names)
-    if person_at is None:
+        return project(source, options, table[0], "y", names=layout.names)
+    if who_at is None:
         alone(source, options)
-        table = _one(people[""], first, count, layout)
-        return build(source, options, table[..., :2], table[..., 2], layout=layout)
-    bodies = [_person(who, _one(rows, first, count, layout)) for who, rows in people.items()]
+        return build(source, options, table[0], sure[0], layout=layout)
+    bodies = [_person(who, table[i], sure[i]) for who, i in people.items()]
     bodies = sorted((b for b in bodies if b.seen), key=lambda body: -body.evidence)
     if not bodies:
         raise source.error("no point has x and y in any frame")
@@ -121,17 +123,17 @@ def _read_long(source: Source, options: ReadOptions, head: Sequence[str]) -> Tra
     return build(source, options, xy, confidence, layout=layout)
 
 
-def _one(rows: Mapping[tuple[int, int], list[float]], first: int, count: int, layout: Layout) -> Floats:
-    """(frames, points, axes and confidence) of one person."""
-    table = np.full((count, len(layout.names), len(next(iter(rows.values())))), np.nan)
-    for (frame, point), values in rows.items():
-        table[frame - first, point] = values
-    return table
+def _check_single(source: Source, index: np.ndarray) -> None:
+    order = np.sort(index, kind="stable")
+    if (order[1:] == order[:-1]).any():
+        twice = order[:-1][order[1:] == order[:-1]][0]
+        row = int(np.flatnonzero(index == twice)[1]) + 2
+        raise source.error(f"row {row}: this point stands twice in its frame")
 
 
-def _person(name: str, table: Floats) -> Person:
-    there = np.isfinite(table).all(-1).any(-1)
-    return Person({f: Detection(table[f, :, :2], table[f, :, 2]) for f in np.flatnonzero(there).tolist()}, name)
+def _person(name: str, xy: Floats, sure: Floats) -> Person:
+    there = np.asarray(np.isfinite(xy).all(-1).any(-1))
+    return Person({f: Detection(xy[f], sure[f]) for f in np.flatnonzero(there).tolist()}, name)
 
 
 def _read_wide(source: Source, options: ReadOptions, head: Sequence[str]) -> Tracks:
@@ -145,7 +147,7 @@ def _read_wide(source: Source, options: ReadOptions, head: Sequence[str]) -> Tra
     for number, row in enumerate(table_rows(source), 1):
         if number > 1:
             numbered.append(number - 2 if frame_at is None else _frame(source, row, frame_at, number))
-            rows.append(np.array([np.nan if c is None else cell_number(source, row, c, number) for c in wanted]))
+            rows.append(np.array(row_numbers(source, row, wanted, number)))
     if len(set(numbered)) < len(numbered):
         raise source.error("two rows have one frame number")
     places, count = frame_numbers(source, numbered)
