@@ -37,7 +37,10 @@ def mutate(path: Path, target: Path, rng: random.Random) -> Path:
     zipped = data[:2] == b"\x1f\x8b"
     plain = gzip.decompress(data) if zipped else data
     if rng.random() < 0.65:
-        plain = _structure(path, plain, rng)
+        try:
+            plain = _structure(plain, rng)
+        except ValueError:  # damaged before, as a file of a folder may be
+            plain = _bytes(plain, rng)
     if zipped and rng.random() < 0.7:
         plain, zipped = gzip.compress(plain, 1), False
     if rng.random() < 0.5:
@@ -46,7 +49,7 @@ def mutate(path: Path, target: Path, rng: random.Random) -> Path:
     return target
 
 
-def _structure(path: Path, data: bytes, rng: random.Random) -> bytes:
+def _structure(data: bytes, rng: random.Random) -> bytes:
     head = data[:8]
     if head[:2] == b"PK":
         return _archive(data, rng)

@@ -16,6 +16,8 @@ import torch
 
 from torchrecon.errors import ReconError
 
+_MAX_MEMBERS = 10_000
+
 
 def write_atomic(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> Path:
     """Let ``write`` fill a temporary file and move it to ``path``: the final name never holds half a file."""
@@ -73,6 +75,8 @@ def read_archive(stream: IO[bytes] | io.BufferedIOBase, source: Path, max_bytes:
     left = max_bytes
     try:
         with zipfile.ZipFile(stream) as archive:
+            if len(archive.infolist()) > _MAX_MEMBERS:
+                raise ValueError(f"{len(archive.infolist())} arrays are more than the {_MAX_MEMBERS} that are read")
             for info in archive.infolist():
                 with archive.open(info) as member:
                     array = read_array(member, info.file_size, left)

@@ -319,6 +319,9 @@ class Tracks:
         unknown = [key for key in arrays if key not in known and not key.startswith("extras/")]
         if unknown:
             raise ReconError(f"{path}: unknown key {unknown[0]!r}; tracks have {', '.join(sorted(known))}, extras/NAME")
+        imaginary = [key for key, array in arrays.items() if array.dtype.kind == "c"]
+        if imaginary:
+            raise ReconError(f"{path}: {imaginary[0]}: is complex; real numbers are needed")
         fields: dict[str, Any] = {key: arrays[key] for key in arrays if key in known}
         try:
             if "fps" in fields:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrecon.io.readers.base import Format, ReadOptions, build, pixels, warn
+from torchrecon.io.readers.base import FARTHEST, Format, ReadOptions, build, pixels, warn
 from torchrecon.io.readers.cotracker import probability
 from torchrecon.io.readers.people import alone
 from torchrecon.io.readers.source import Floats, Source, numbers
@@ -42,7 +42,7 @@ def _query_time_axis(xy: Floats, query: Floats) -> int | None:
     for axis in (0, 1):
         tracks = xy if axis == 1 else xy.swapaxes(0, 1)
         points, frames = tracks.shape[:2]
-        if len(query) != points or not np.isfinite(query).all():
+        if len(query) != points or not (np.abs(query) <= FARTHEST).all():
             errors.append(np.inf)
             continue
         at = tracks[np.arange(points), np.clip(np.round(query[:, 0]), 0, frames - 1).astype(int)]
@@ -97,7 +97,9 @@ def read_tapir(source: Source, options: ReadOptions | None = None) -> Tracks:
     confidence = _confidence(source, xy.shape[:-1])
     if xy.ndim == 4 and len(xy) == 1:
         xy, confidence = xy[0], None if confidence is None else confidence[0]
+    # No position at all rather than infinity or an absurd one: differences of these say nothing.
     one = xy if xy.ndim == 3 else xy[0]
+    one = np.where(np.abs(np.nan_to_num(one, nan=np.inf)) <= FARTHEST, one, np.nan)
     axis = None
     asked = next((key for key in _QUERIES if key in source.arrays), None)
     if asked is not None:
