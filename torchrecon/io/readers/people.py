@@ -214,15 +214,12 @@ def _associate(frames: Mapping[int, Sequence[Detection]], p: FollowParams) -> li
 
 
 def _costs(active: Sequence[_Followed], found: Sequence[Detection], frame: int, p: FollowParams) -> Floats:
-    """(active, found) median joint distance over what may be moved in the gap; 2 where no joint is shared."""
+    """(active, found) median joint distance as a share of what may be moved in the gap; 2 where no joint is shared."""
     gaps = np.array([frame - a.last for a in active], dtype=np.float64)
     predicted = np.stack([a.position + (frame - a.last) * a.velocity for a in active])
-    here = np.stack([d.xy for d in found])
-    costs = np.full((len(active), len(found)), 2.0)
-    for row, (person, gap) in enumerate(zip(active, gaps, strict=True)):
-        allowed = (p.reach + p.spread * (gap - 1)) * max(person.size, 1e-6)
-        distance = np.linalg.norm(here - predicted[row], axis=-1)
-        shared = np.isfinite(distance).any(-1)
-        if shared.any():
-            costs[row, shared] = np.nanmedian(distance[shared], axis=-1) / allowed
-    return costs
+    allowed = (p.reach + p.spread * (gaps - 1)) * np.maximum([a.size for a in active], 1e-6)
+    distance = np.linalg.norm(predicted[:, None] - np.stack([d.xy for d in found]), axis=-1)
+    ordered = np.sort(distance, axis=-1)  # NaN, where a joint is not seen on both sides, goes last
+    count = np.isfinite(distance).sum(-1, keepdims=True)
+    middle = [np.take_along_axis(ordered, np.maximum(at, 0), -1)[..., 0] for at in ((count - 1) // 2, count // 2)]
+    return np.where(count[..., 0] > 0, (middle[0] + middle[1]) / 2 / allowed[:, None], 2.0)
