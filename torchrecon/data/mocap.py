@@ -20,6 +20,7 @@ __all__ = ["MocapClip", "load_mocap", "read_bvh"]
 
 _VECTORS = ("label", "subject", "trial", "source", "quality", "license")
 _MAX_BYTES = 1 << 26
+_MAX_POSITIONS = 1 << 21  # each comes with a rotation matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +102,11 @@ def read_bvh(path: str | Path, metres_per_unit: float = 0.01) -> MocapClip:
         raise ReconError(f"{file}: there is no such file; give the path of a BVH file")
     if file.stat().st_size > _MAX_BYTES:
         raise ReconError(f"{file}: larger than {_MAX_BYTES} bytes; cut the recording into pieces")
-    lines = [line.split() for line in file.read_text(errors="replace").splitlines()]
+    lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     skeleton, at = _bvh_hierarchy(file, lines)
     frames, fps = _bvh_frames(file, lines, at, sum(len(c) for c in skeleton.channels))
+    if len(frames) * len(skeleton.names) > _MAX_POSITIONS:
+        raise ReconError(f"{file}: {len(frames)} frames of {len(skeleton.names)} joints; cut the recording into pieces")
     values = torch.from_numpy(frames)
     positions: list[Tensor] = []
     rotations: list[Tensor] = []
@@ -140,12 +143,13 @@ class _BvhSkeleton:
     channels: list[list[str]]
 
 
-def _bvh_hierarchy(file: Path, lines: list[list[str]]) -> tuple[_BvhSkeleton, int]:
+def _bvh_hierarchy(file: Path, lines: list[str]) -> tuple[_BvhSkeleton, int]:
     """The skeleton, and the index of the line MOTION."""
     skeleton = _BvhSkeleton([], [], [], [])
     stack: list[int] = []
     opened = -1
-    for number, words in enumerate(lines):
+    for number, line in enumerate(lines):
+        words = line.split()
         if not words or words[0] == "HIERARCHY":
             continue
         key = words[0]
@@ -184,9 +188,9 @@ def _bvh_hierarchy(file: Path, lines: list[list[str]]) -> tuple[_BvhSkeleton, in
     raise ReconError(f"{file}: there is no line MOTION; this is not a BVH file, or it is cut off")
 
 
-def _bvh_frames(file: Path, lines: list[list[str]], at: int, width: int) -> tuple[np.ndarray, float]:
-    rows = [(number, words) for number, words in enumerate(lines[at + 1 :], at + 2) if words]
-    head = {words[0]: words for _, words in rows[:2]}
+def _bvh_frames(file: Path, lines: list[str], at: int, width: int) -> tuple[np.ndarray, float]:
+    rows = [(number, line) for number, line in enumerate(lines[at + 1 :], at + 2) if line.strip()]
+    head = {line.split()[0]: line.split() for _, line in rows[:2]}
     if "Frames:" not in head or "Frame" not in head:
         raise ReconError(f"{file}: line {at + 2}: MOTION must go on with 'Frames: n' and 'Frame Time: seconds'")
     try:
@@ -199,7 +203,8 @@ def _bvh_frames(file: Path, lines: list[list[str]], at: int, width: int) -> tupl
             f"{file}: {count} frames of {seconds} s are announced, {len(body)} are there; the file is cut off"
         )
     values = np.empty((count, width))
-    for index, (number, words) in enumerate(body[:count]):
+    for index, (number, line) in enumerate(body[:count]):
+        words = line.split()
         if len(words) != width:
             raise ReconError(f"{file}: line {number} has {len(words)} values; the channels of the skeleton are {width}")
         try:

@@ -89,11 +89,11 @@ def _tracks(
     people, solid = [], []
     for who in dict.fromkeys(who for who, _, _ in columns):
         xyz = np.stack([get(who, axis) for axis in "xyz"], -1)
-        if not np.isfinite(xyz[..., :2]).any():
+        there = np.asarray(np.isfinite(xyz[..., :2]).all(-1).any(-1))
+        if not there.any():
             continue
         scored = any((who, part, "likelihood") in place for part in parts)
         confidence = get(who, "likelihood") if scored else np.ones(xyz.shape[:-1])
-        there = np.asarray(np.isfinite(xyz[..., :2]).all(-1).any(-1))
         seen = {row: Detection(xyz[i, :, :2], confidence[i]) for i, row in enumerate(rows) if there[i]}
         people.append(Person(seen, who))
         solid.append(np.isfinite(xyz[..., 2]).any())
