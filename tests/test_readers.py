@@ -11,7 +11,8 @@ import pytest
 
 import torchrecon as tr
 from tests import track_files as files
-from tests.track_files import FRAMES, WRITERS, check, load, scores, walk
+from tests.reading import check, load
+from tests.track_files import FRAMES, WRITERS, scores, walk
 from torchrecon.cli import main
 from torchrecon.data import read_c3d, read_trc
 from torchrecon.io.readers import FORMATS, ConfidenceParams, Source, detect
@@ -330,6 +331,10 @@ def test_command_line_reads_them_too(tmp_path, capsys):
     assert main(["rank", markers]) == 2
     assert "--view" in capsys.readouterr().err
     assert main(["rank", markers, "--view", "side", "--fps", "50"]) == 0
+    np.savez(tmp_path / "shares.npz", tracks=walk(6) / [640, 480])
+    capsys.readouterr()
+    assert main(["rank", str(tmp_path / "shares.npz"), "--image-size", "480", "640"]) == 0
+    assert "square" not in capsys.readouterr().err
 
 
 @pytest.mark.data

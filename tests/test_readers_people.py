@@ -9,7 +9,8 @@ import pytest
 
 import torchrecon as tr
 from tests import track_files as files
-from tests.track_files import check, load, scores, walk
+from tests.reading import check, load
+from tests.track_files import scores, walk
 from torchrecon.io.readers import Source
 from torchrecon.io.readers.people import Detection, follow
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import gzip
 import json
 import pickle
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-
-import torchrecon as tr
 
 FRAMES = 12
 
@@ -31,21 +28,6 @@ def walk(points: int, start: tuple[float, float] = (100.0, 200.0), speed: float 
 def scores(points: int, frames: int = FRAMES):
     """(frames, points) confidence in eighths: some 0 (not seen), some 1."""
     return np.random.default_rng(points + 1).integers(0, 9, (frames, points)) / 8
-
-
-def load(path, **options):
-    """The tracks and what the reader had to say."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        tracks = tr.load_tracks(path, **options)
-    return tracks, [str(w.message) for w in said]
-
-
-def check(tracks, xy, confidence=None, floor=0.1):
-    """Positions where the confidence is above the floor, nothing elsewhere."""
-    seen = np.ones(xy.shape[:-1], bool) if confidence is None else confidence > floor
-    np.testing.assert_array_equal(tracks.visible.numpy(), seen)
-    np.testing.assert_allclose(tracks.xy.numpy()[seen], xy[seen], rtol=0, atol=1e-9)
 
 
 def _json(path: Path, content: Any) -> Path:
