@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 
-.PHONY: setup table1 test lint kill page clean
+.PHONY: setup table1 test fuzz lint kill page clean
 
 setup: $(VENV)/.stamp
 
@@ -19,6 +19,9 @@ table1: setup
 
 test: setup lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations=20 -q
+
+fuzz: setup
+	$(BIN)/python -m tests.fuzz --count 2000
 
 lint: setup
 	$(BIN)/ruff check .

@@ -77,6 +77,8 @@ def test_bvh_rotation_order_is_that_of_the_channels(tmp_path):
         ("10 100 5 90 0 0 0 0 0", "10 100 5 90", "line 20 has 4 values; the channels of the skeleton are 9"),
         ("10 100 5 90 0 0 0 0 0", "10 100 5 90 0 0 0 0 x", "line 20 holds something that is no number"),
         ("Frames: 3", "Frames: 4", "4 frames .* are announced, 3 are there"),
+        ("Frames: 3", "Frames: three", "need a number each"),
+        ("Frame Time: 0.04", "Frame Time: nan", "3 frames of nan s are announced"),
         ("Zrotation Xrotation Yrotation\n    End", "Zrotation Qrotation Yrotation\n    End", "line 9 is not BVH"),
         ("OFFSET 0 -40 0", "OFFSET 0 -40", "line 8 is not BVH"),
     ],

@@ -7,6 +7,7 @@ import json
 import shlex
 import sys
 from pathlib import Path
+import warnings
 from typing import Any
 
 import torch
@@ -30,10 +31,9 @@ def run(options: argparse.Namespace) -> None:
 
 def solve(options: argparse.Namespace) -> None:
     """``torchrecon solve``."""
-    from torchrecon.io.tracks import load_tracks
     from torchrecon.pipeline.reconstructor import reconstruct as reconstruct_tracks
 
-    tracks = load_tracks(options.tracks).to(options.device)
+    tracks = _load(options)
     if options.camera is not None:
         tracks = _with_camera(tracks, options.camera)
     answer = reconstruct_tracks(tracks, _rank(options.rank), options.solver, generator=_generator(options))
@@ -43,10 +43,9 @@ def solve(options: argparse.Namespace) -> None:
 
 def rank(options: argparse.Namespace) -> None:
     """``torchrecon rank``."""
-    from torchrecon.io.tracks import load_tracks
     from torchrecon.rank import estimate_rank
 
-    tracks = load_tracks(options.tracks).to(options.device)
+    tracks = _load(options)
     estimate = estimate_rank(tracks, options.rule, options.layout, generator=_generator(options))
     fields = {name: plain(getattr(estimate, name)) for name in RankEstimate.__dataclass_fields__}
     if options.out is not None:
@@ -161,6 +160,19 @@ def _tracks_of(options: argparse.Namespace, reconstruction: Path) -> Path | None
     beside = reconstruction.with_name("tracks.npz")
     of_a_run = any(reconstruction.with_name(name).is_file() for name in ("run.json", "item.json"))
     return beside if of_a_run and beside.is_file() else None
+
+
+def _load(options: argparse.Namespace) -> Tracks:
+    """The tracks file, with what its reader has to say on stderr."""
+    from torchrecon.io.tracks import load_tracks
+
+    size = None if options.image_size is None else tuple(options.image_size)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        tracks = load_tracks(options.tracks, person=options.person, view=options.view, image_size=size, fps=options.fps)
+    for warning in said:
+        print(f"warning: {warning.message}", file=sys.stderr)
+    return tracks.to(options.device)
 
 
 def _config(options: argparse.Namespace) -> Any:

@@ -21,14 +21,14 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     solve = _command(commands, "solve", "tracks file to points3d, rotations, rank, ...")
-    solve.add_argument("tracks", metavar="TRACKS", help=".npz with xy (frames, points, 2) and optional fields")
+    _tracks(solve)
     solve.add_argument("-o", "--out", required=True, metavar="OUT.npz", help="replaced atomically")
     solve.add_argument("--rank", default="auto", metavar="auto|INT", help="number of shape bases (default: auto)")
     solve.add_argument("--solver", default="auto", metavar="NAME", help="solver (default: auto)")
     solve.add_argument("--camera", metavar="FILE", help="camera JSON with the 3x3 intrinsics")
 
     rank = _command(commands, "rank", "number of shape bases of a tracks file")
-    rank.add_argument("tracks", metavar="TRACKS", help="as for solve")
+    _tracks(rank)
     rank.add_argument("-o", "--out", metavar="OUT.json", help="also write the result here")
     rank.add_argument("--rule", default="auto", metavar="NAME", help="rule (default: auto)")
     rank.add_argument("--layout", choices=["vector", "stack"], help="default: the rule's own")
@@ -112,6 +112,20 @@ def _command(
     command.add_argument("--seed", type=int, default=0, help="seed of all randomness (default: 0)")
     command.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
     return command
+
+
+def _tracks(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "tracks",
+        metavar="TRACKS",
+        help="own .npz; CoTracker, TAPIR arrays; OpenPose (also a folder), COCO, MediaPipe, MMPose JSON; Penn Action; "
+        "DeepLabCut, SLEAP; CSV; with --view C3D, TRC, BVH; told by content",
+    )
+    command.add_argument("--person", type=int, metavar="N", help="which person (default: 0, the longest and surest)")
+    command.add_argument("--view", choices=["front", "side", "top"], help="take this view of a 3D file, 1 px = 1 mm")
+    command.add_argument("--fps", type=float, help="frames per second (default: what the file states, else 25)")
+    size = ("HEIGHT", "WIDTH")
+    command.add_argument("--image-size", type=int, nargs=2, metavar=size, help="pixels, for positions given as shares")
 
 
 def _video(command: argparse.ArgumentParser) -> None:

@@ -1,10 +1,11 @@
-"""Readers of motion capture: the project's npz collections, BVH and C3D.
+"""Readers of motion capture with a skeleton: the project's npz collections and BVH.
 
-All deliver metres. The npz collections and most BVH files have y up; C3D files keep the axes of their laboratory.
+Both deliver metres; the npz collections and most BVH files have y up.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +16,11 @@ import torch
 from torchrecon._typing import Float, Tensor
 from torchrecon.errors import ReconError
 
-__all__ = ["Markers", "MocapClip", "load_mocap", "read_bvh", "read_c3d"]
+__all__ = ["MocapClip", "load_mocap", "read_bvh"]
 
 _VECTORS = ("label", "subject", "trial", "source", "quality", "license")
-_METRES = {"mm": 0.001, "cm": 0.01, "dm": 0.1, "m": 1.0, "in": 0.0254, "ft": 0.3048}
+_MAX_BYTES = 1 << 26
+_MAX_POSITIONS = 1 << 21  # each comes with a rotation matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,15 +48,6 @@ class MocapClip:
 
     def __len__(self) -> int:
         return self.joints.shape[0]
-
-
-@dataclass(frozen=True, eq=False)
-class Markers:
-    """Labelled markers of a C3D file, metres, in the laboratory's axes; NaN where a marker was not seen."""
-
-    positions: Float[Tensor, "frames markers 3"]
-    names: tuple[str, ...]
-    fps: float
 
 
 def load_mocap(path: str | Path, labels: Sequence[str] | None = None) -> list[MocapClip]:
@@ -107,9 +100,13 @@ def read_bvh(path: str | Path, metres_per_unit: float = 0.01) -> MocapClip:
     file = Path(path)
     if not file.is_file():
         raise ReconError(f"{file}: there is no such file; give the path of a BVH file")
-    lines = [line.split() for line in file.read_text(errors="replace").splitlines()]
+    if file.stat().st_size > _MAX_BYTES:
+        raise ReconError(f"{file}: larger than {_MAX_BYTES} bytes; cut the recording into pieces")
+    lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     skeleton, at = _bvh_hierarchy(file, lines)
     frames, fps = _bvh_frames(file, lines, at, sum(len(c) for c in skeleton.channels))
+    if len(frames) * len(skeleton.names) > _MAX_POSITIONS:
+        raise ReconError(f"{file}: {len(frames)} frames of {len(skeleton.names)} joints; cut the recording into pieces")
     values = torch.from_numpy(frames)
     positions: list[Tensor] = []
     rotations: list[Tensor] = []
@@ -146,12 +143,13 @@ class _BvhSkeleton:
     channels: list[list[str]]
 
 
-def _bvh_hierarchy(file: Path, lines: list[list[str]]) -> tuple[_BvhSkeleton, int]:
+def _bvh_hierarchy(file: Path, lines: list[str]) -> tuple[_BvhSkeleton, int]:
     """The skeleton, and the index of the line MOTION."""
     skeleton = _BvhSkeleton([], [], [], [])
     stack: list[int] = []
     opened = -1
-    for number, words in enumerate(lines):
+    for number, line in enumerate(lines):
+        words = line.split()
         if not words or words[0] == "HIERARCHY":
             continue
         key = words[0]
@@ -190,19 +188,23 @@ def _bvh_hierarchy(file: Path, lines: list[list[str]]) -> tuple[_BvhSkeleton, in
     raise ReconError(f"{file}: there is no line MOTION; this is not a BVH file, or it is cut off")
 
 
-def _bvh_frames(file: Path, lines: list[list[str]], at: int, width: int) -> tuple[np.ndarray, float]:
-    rows = [(number, words) for number, words in enumerate(lines[at + 1 :], at + 2) if words]
-    head = {words[0]: words for _, words in rows[:2]}
+def _bvh_frames(file: Path, lines: list[str], at: int, width: int) -> tuple[np.ndarray, float]:
+    rows = [(number, line) for number, line in enumerate(lines[at + 1 :], at + 2) if line.strip()]
+    head = {line.split()[0]: line.split() for _, line in rows[:2]}
     if "Frames:" not in head or "Frame" not in head:
         raise ReconError(f"{file}: line {at + 2}: MOTION must go on with 'Frames: n' and 'Frame Time: seconds'")
-    count, seconds = int(head["Frames:"][1]), float(head["Frame"][2])
+    try:
+        count, seconds = int(head["Frames:"][1]), float(head["Frame"][2])
+    except (IndexError, ValueError) as error:
+        raise ReconError(f"{file}: line {at + 2}: 'Frames: n' and 'Frame Time: seconds' need a number each") from error
     body = rows[2:]
-    if len(body) < count or seconds <= 0:
+    if not 0 < count <= len(body) or not 0 < seconds < math.inf:
         raise ReconError(
             f"{file}: {count} frames of {seconds} s are announced, {len(body)} are there; the file is cut off"
         )
     values = np.empty((count, width))
-    for index, (number, words) in enumerate(body[:count]):
+    for index, (number, line) in enumerate(body[:count]):
+        words = line.split()
         if len(words) != width:
             raise ReconError(f"{file}: line {number} has {len(words)} values; the channels of the skeleton are {width}")
         try:
@@ -220,35 +222,3 @@ def _axis_rotation(angle: Tensor, axis: int) -> Tensor:
     matrix[..., j, i] = angle.sin()
     matrix[..., i, j] = -angle.sin()
     return matrix
-
-
-def read_c3d(path: str | Path) -> Markers:
-    """Markers of a C3D file; needs the extra ``io`` (ezc3d).
-
-    Raises:
-        ReconError: no such file, ezc3d is not installed, no markers, or an unknown unit.
-    """
-    file = Path(path)
-    if not file.is_file():
-        raise ReconError(f"{file}: there is no such file; give the path of a C3D file")
-    try:
-        import ezc3d
-    except ImportError as error:
-        raise ReconError("reading C3D needs ezc3d; install it with: pip install 'torchrecon[io]'") from error
-    try:
-        content = ezc3d.c3d(str(file))
-    except Exception as error:
-        raise ReconError(f"{file}: ezc3d cannot read it as C3D ({error}); repair or export the file again") from error
-    point = content["parameters"]["POINT"]
-    positions = content["data"]["points"][:3]
-    if positions.shape[1] == 0 or positions.shape[2] == 0:
-        raise ReconError(f"{file}: it holds no markers; choose a recording with 3D points")
-    unit = str(point["UNITS"]["value"][0]).strip().lower() if point.get("UNITS", {}).get("value") else "mm"
-    if unit not in _METRES:
-        raise ReconError(f"{file}: POINT:UNITS is {unit!r}; known are {', '.join(_METRES)}")
-    metres = torch.from_numpy(np.ascontiguousarray(positions.transpose(2, 1, 0))) * _METRES[unit]
-    names = tuple(str(name).strip() for name in point["LABELS"]["value"])[: positions.shape[1]]
-    rate = float(point["RATE"]["value"][0])
-    if rate <= 0:
-        raise ReconError(f"{file}: POINT:RATE is {rate}; it must be positive")
-    return Markers(metres.to(torch.get_default_dtype()), names, rate)

@@ -308,13 +308,20 @@ class Tracks:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Tracks:
         """Read what :meth:`save` wrote; raises ReconError that names file and key."""
-        arrays = read_npz(path)
+        return cls.from_arrays(read_npz(path), path)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], path: str | os.PathLike[str]) -> Tracks:
+        """Tracks from the arrays that :meth:`save` writes, by name; ``path`` stands in the errors."""
         if "xy" not in arrays:
             raise ReconError(f"{path}: has no key 'xy'; keys found: {', '.join(sorted(arrays)) or 'none'}")
         known = {"xy", "visible", "fps", "names", "edges", *_TENSORS}
         unknown = [key for key in arrays if key not in known and not key.startswith("extras/")]
         if unknown:
             raise ReconError(f"{path}: unknown key {unknown[0]!r}; tracks have {', '.join(sorted(known))}, extras/NAME")
+        imaginary = [key for key, array in arrays.items() if array.dtype.kind == "c"]
+        if imaginary:
+            raise ReconError(f"{path}: {imaginary[0]}: is complex; real numbers are needed")
         fields: dict[str, Any] = {key: arrays[key] for key in arrays if key in known}
         try:
             if "fps" in fields:
@@ -325,5 +332,5 @@ class Tracks:
                 fields["edges"] = tuple((int(a), int(b)) for a, b in fields["edges"])
             extras = {key[7:]: torch.as_tensor(arrays[key]) for key in arrays if key.startswith("extras/")}
             return cls(**fields, extras=extras or None)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise ReconError(f"{path}: {error}") from error
