@@ -5,6 +5,9 @@ orthonormal in every frame. In ``G = Q Q^T`` these conditions are linear; of the
 them the one of least trace is sought (a semidefinite programme, solved by splitting), its three leading eigenvectors
 start a damped Gauss-Newton refinement of Q itself. The trace is taken in the basis ``U sqrt(s)``, in which a weak
 column of M is dear: where several triplets fit, the one that lives in the strong columns is taken.
+
+A turn in proportion to a shape weight violates orthonormality to second order only. Where shapes change slowly the
+minimum is therefore flat along such turns: the shape seen by the camera is right, and the world frame drifts.
 """
 
 from __future__ import annotations
@@ -60,32 +63,25 @@ def _products(u: Tensor, v: Tensor) -> Float[Tensor, "frames packed"]:
 
 
 def least_trace_gram(
-    motion: Float[Tensor, "frames 2 m"], *, scaled: bool, penalty: float = 1e-3, iterations: int = 300
+    motion: Float[Tensor, "frames 2 m"], *, penalty: float = 1e-3, iterations: int = 300
 ) -> Float[Tensor, "m m"]:
     """Minimise ``penalty tr G + violation / 2`` over positive semidefinite G, by the splitting of Douglas and Rachford.
 
     Args:
-        motion: rows of the column space, the mean over frames of G's diagonal blocks of the order of one.
-        scaled: demand equal size and orthogonality of the two rows of a frame, and unit size in the mean only;
-            otherwise unit size in every frame.
+        motion: rows of the column space, of the order of one; orthonormality is demanded of unit rows.
 
     Example:
         >>> import torch
         >>> from torchrecon.linalg import rotation_from_vector
         >>> rows = rotation_from_vector(torch.randn(30, 3, generator=torch.Generator().manual_seed(0)))[:, :2]
-        >>> gram = least_trace_gram(rows, scaled=False, penalty=1e-6)
+        >>> gram = least_trace_gram(rows, penalty=1e-6)
         >>> bool((gram - torch.eye(3)).abs().max() < 1e-3)
         True
     """
     u, v = motion[:, 0], motion[:, 1]
     frames, m = u.shape
-    uu, vv, uv = _products(u, u), _products(v, v), _products(u, v)
-    if scaled:
-        rows = torch.cat([(uu - vv) / 2**0.5, 2**0.5 * uv, (uu + vv).mean(0, keepdim=True) * (frames / 2) ** 0.5])
-        target = torch.cat([u.new_zeros(2 * frames), u.new_full((1,), (2.0 * frames) ** 0.5)])
-    else:
-        rows = torch.cat([uu, vv, 2**0.5 * uv])
-        target = torch.cat([u.new_ones(2 * frames), u.new_zeros(frames)])
+    rows = torch.cat([_products(u, u), _products(v, v), 2**0.5 * _products(u, v)])
+    target = torch.cat([u.new_ones(2 * frames), u.new_zeros(frames)])
     normal, right = rows.mT @ rows / frames, rows.mT @ target / frames
     weight = 0.1 * normal.diagonal().mean()
     factor = torch.linalg.cholesky(normal + weight * torch.eye(len(normal), dtype=u.dtype, device=u.device))
@@ -149,7 +145,9 @@ def gram_upgrade(
     Args:
         stack: rows u_1, v_1, u_2, v_2, ...; columns beyond its numerical rank are not used.
         columns: 3K.
-        scaled: see :func:`least_trace_gram`; each frame then has a scale of its own.
+        scaled: demand equal size and orthogonality of the two rows of a frame, and unit size in the mean only, so
+            that each frame has a scale of its own; otherwise unit size in every frame. With more than one basis a
+            scale and a common change of all weights are the same thing; the one found is near to constant.
 
     Example:
         >>> import torch
@@ -167,7 +165,7 @@ def gram_upgrade(
     frames = stack.shape[0] // 2
     root = (s[:kept] / s[0].clamp_min(torch.finfo(s.dtype).tiny)).sqrt()
     motion = (u[:, :kept] * root * frames**0.5).unflatten(0, (frames, 2))
-    gram = least_trace_gram(motion, scaled=scaled, penalty=params.penalty, iterations=params.splitting)
+    gram = least_trace_gram(motion, penalty=params.penalty, iterations=params.splitting)
     values, vectors = torch.linalg.eigh(gram)
     q = vectors[:, -3:] * values[-3:].clamp_min(0).sqrt()
     q = torch.nn.functional.pad(q, (3 - q.shape[1], 0))
