@@ -253,6 +253,18 @@ def test_single_precision_gives_the_same_answer(name):
     assert error3d_camera(single.double(), double) < 4e-2
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["csf", "em_ppca"])
+def test_an_empty_frame_and_a_point_never_seen_do_no_harm(name, dtype):
+    shapes, rotations = _world(torch.ones(30, 1), 15)
+    truth = shapes @ rotations.mT
+    visible = torch.ones(30, 15, dtype=torch.bool)
+    visible[7], visible[:, 3] = False, False
+    rec = get_solver(name)(Tracks(100 * truth[..., :2].to(dtype), visible), 1)
+    assert bool(torch.isfinite(rec.points3d).all())
+    assert error3d_camera(rec.points3d.double(), 100 * truth, visible) < 1e-2
+
+
 def test_iteration_limits_are_reported():
     time = torch.linspace(0, 1, 30)
     shapes, rotations = _world(torch.stack([torch.ones(30), 0.3 * (4 * time).sin()], 1), 15)

@@ -131,7 +131,7 @@ def _fit(
             residual = data.xy - shapes @ rows.mT * factor
             total = information.sum(1)
             pull = (information @ residual[..., None]).sum(1)
-            translation = torch.linalg.lstsq(total, pull).solution[..., 0]
+            translation = (torch.linalg.pinv(total, hermitian=True) @ pull)[..., 0]
     return shapes, translation, converged
 
 

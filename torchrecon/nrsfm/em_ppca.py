@@ -112,7 +112,8 @@ def _maximise(
     weighted = information @ slope
     normal = torch.einsum("cfpai,cfpaj->fij", slope, weighted)
     gradient = torch.einsum("cfpai,cfpa->fi", weighted, residual)
-    damping = 1e-9 * normal.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None].clamp_min(1e-30)
+    damping = 1e-9 * normal.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
+    damping = torch.where(damping > 0, damping, torch.ones_like(damping))
     eye3 = torch.eye(3, dtype=normal.dtype, device=normal.device)
     step = torch.linalg.solve(normal + damping * eye3, gradient[..., None])[..., 0]
     step = step / (step.norm(dim=-1, keepdim=True) / 0.3).clamp_min(1)
@@ -121,7 +122,8 @@ def _maximise(
     scale = model.scale
     if scaled:
         weighted_plane = (information @ plane[..., None])[..., 0]
-        scale = (weighted_plane * target).sum((0, 2, 3)) / (weighted_plane * plane).sum((0, 2, 3)).clamp_min(1e-30)
+        fit, norm = (weighted_plane * target).sum((0, 2, 3)), (weighted_plane * plane).sum((0, 2, 3))
+        scale = torch.where(norm > 0, fit / norm, scale)
         size = scale.mean()
         scale, bases, plane = scale / size, bases * size, plane * size
     residual = target - plane * scale[:, None, None]
