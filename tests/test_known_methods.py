@@ -253,6 +253,16 @@ def test_single_precision_gives_the_same_answer(name):
     assert error3d_camera(single.double(), double) < 4e-2
 
 
+@pytest.mark.parametrize("name", ["csf", "em_ppca"])
+def test_tracks_in_short_bands_are_not_called_solved(name):
+    shapes, rotations = _world(torch.ones(60, 1), 90)
+    start = torch.arange(90) % 45
+    time = torch.arange(60)[:, None]
+    rec = get_solver(name)(Tracks((shapes @ rotations.mT)[..., :2], (time >= start) & (time < start + 15)), 1)
+    assert rec.status.code == "undetermined"
+    assert "share fewer than 4 points" in rec.status.text
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["csf", "em_ppca"])
 def test_an_empty_frame_and_a_point_never_seen_do_no_harm(name, dtype):

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import torch
 
-from torchrecon._typing import Float, Tensor
+from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.errors import ReconError
 from torchrecon.linalg.missing_factors import fit_factors, grow_factors, start_factors
 from torchrecon.measurement import Reconstruction, Status
-from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, turn_of_view
+from torchrecon.nrsfm.base import MIN_POINTS, check_size, looks_static, mirror_sign, turn_of_view
 from torchrecon.nrsfm.observations import Observations
 
-__all__ = ["conclude", "filled", "require_complete"]
+__all__ = ["conclude", "filled", "linked_frames", "require_complete"]
 
 STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
+LEAST_LINKED = 0.95  # share of frame pairs with points in common below which a low-rank model guesses the rest
 
 
 def require_complete(data: Observations, name: str) -> None:
@@ -46,6 +47,18 @@ def filled(
     return xy, xy.mean(1)
 
 
+def linked_frames(visible: Bool[Tensor, "frames points"]) -> float:
+    """Share of the pairs of frames that have at least four points in common; of at most about 200 frames.
+
+    Example:
+        >>> import torch
+        >>> linked_frames(torch.ones(5, 4, dtype=torch.bool)), linked_frames(torch.eye(5, dtype=torch.bool))
+        (1.0, 0.0)
+    """
+    seen = visible[:: max(1, len(visible) // 200)].to(torch.float32)
+    return float((seen @ seen.T >= MIN_POINTS).to(torch.float32).mean())
+
+
 def conclude(
     data: Observations,
     points3d: Float[Tensor, "frames points 3"],
@@ -73,6 +86,13 @@ def conclude(
     if status is None and (turn < STATIC_TURN or (complete and looks_static(data.xy - data.xy.mean(1, keepdim=True)))):
         status = Status(
             "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
+        )
+    linked = linked_frames(data.visible)
+    if status is None and linked < LEAST_LINKED:
+        status = Status(
+            "undetermined",
+            f"{1 - linked:.0%} of the pairs of frames share fewer than {MIN_POINTS} points; the cameras of this method "
+            "need tracks that last, use solver 'auto'",
         )
     if status is None and complaint is not None:
         status = Status("not_converged", complaint)
