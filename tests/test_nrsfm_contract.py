@@ -14,7 +14,8 @@ from torchrecon.metrics import error3d_camera
 from torchrecon.nrsfm import SOLVERS, get_solver
 from torchrecon.nrsfm.lowrank import LowRankParams, solve_complete
 
-COMPLETE_ONLY = {"logdet"}
+COMPLETE_ONLY = {"bmm", "logdet", "pta"}
+KNOWN_METHODS = ("bmm", "csf", "em_ppca", "pta")
 
 
 def _world(rank: int = 1, frames: int = 40, points: int = 20, *, seed: int = 0, rate: float = 100.0):
@@ -45,7 +46,7 @@ def test_exact_on_clean_rigid_data(name):
     torch.testing.assert_close(rec.points3d.mean(-2), torch.zeros(40, 3), atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["auto"])
+@pytest.mark.parametrize("name", ["auto", "em_ppca"])
 def test_exact_on_clean_rank_3k_data(name):
     truth = _world(rank=2, frames=60, points=24)
     rec = get_solver(name)(Tracks(truth[..., :2]), 2)
@@ -54,7 +55,7 @@ def test_exact_on_clean_rank_3k_data(name):
     assert rec.basis.shape == (2, 24, 3)
 
 
-@pytest.mark.parametrize("name", ["auto", "rigid"])
+@pytest.mark.parametrize("name", ["auto", "rigid", *KNOWN_METHODS])
 def test_error_grows_in_step_with_the_noise(name):
     truth = _world()
     noise = torch.randn(truth[..., :2].shape, generator=torch.Generator().manual_seed(1))
@@ -67,7 +68,7 @@ def test_error_grows_in_step_with_the_noise(name):
     assert 0.7 < slope < 1.3, errors.tolist()
 
 
-@pytest.mark.parametrize("name", ["logdet", "rigid", "trajectory"])
+@pytest.mark.parametrize("name", ["logdet", "rigid", "trajectory", *KNOWN_METHODS])
 def test_follows_point_order_and_translation(name):
     truth = _world()
     solve = get_solver(name)
@@ -80,7 +81,7 @@ def test_follows_point_order_and_translation(name):
     torch.testing.assert_close(moved.points3d, straight.points3d, atol=float(2e-3 * size), rtol=0)
 
 
-@pytest.mark.parametrize("name", ["logdet", "rigid"])
+@pytest.mark.parametrize("name", ["logdet", "rigid", *KNOWN_METHODS])
 def test_follows_image_rotation(name):
     truth = _world()
     turn = rotation_from_vector(torch.tensor([0.0, 0.0, 0.7]))
@@ -142,7 +143,7 @@ def test_too_few_points_end_in_a_status(name):
     assert isinstance(rec, Reconstruction)
     assert rec.status.code == "degenerate"
     assert "at least 4 points" in rec.status.text
-    if name in ("auto", "logdet"):
+    if name not in ("rigid", "trajectory"):
         rec = get_solver(name)(Tracks(truth[..., :2]), 4)
         assert rec.status.code == "degenerate"
         assert "at least 13 points" in rec.status.text
@@ -205,5 +206,6 @@ def test_unknown_solver_and_rank_are_named():
     tracks = Tracks(_world()[..., :2])
     with pytest.raises(ReconError, match="rank"):
         get_solver("rigid")(tracks, 0)
-    with pytest.raises(ReconError, match="every point in every frame"):
-        get_solver("logdet")(Tracks(tracks.xy, _gaps(40, 20)), 1)
+    for name in sorted(COMPLETE_ONLY):
+        with pytest.raises(ReconError, match="every point in every frame"):
+            get_solver(name)(Tracks(tracks.xy, _gaps(40, 20)), 1)

@@ -30,7 +30,7 @@ CORE = {
 }
 # Extra, its distributions, and what it gives.
 EXTRAS: dict[str, tuple[tuple[str, ...], str]] = {
-    "io": (("ezc3d",), "reads and writes C3D marker files"),
+    "io": (("ezc3d", "h5py"), "writes C3D marker files, reads DeepLabCut and SLEAP H5 files"),
     "viz": (("matplotlib",), "draws views.png beside a reconstruction, and figures"),
     "rerun": (("rerun-sdk",), "exports .rrd recordings for the Rerun viewer"),
     "train": (("jsonargparse",), "trains the recogniser from the command line"),

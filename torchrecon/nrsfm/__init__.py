@@ -7,14 +7,28 @@ from difflib import get_close_matches
 from torchrecon.errors import ReconError
 from torchrecon.measurement import Solver
 from torchrecon.nrsfm.auto import auto
+from torchrecon.nrsfm.bmm import bmm
+from torchrecon.nrsfm.csf import csf
+from torchrecon.nrsfm.em_ppca import em_ppca
 from torchrecon.nrsfm.lowrank import logdet
 from torchrecon.nrsfm.marginal import marginal
+from torchrecon.nrsfm.pta import pta
 from torchrecon.nrsfm.rigid import rigid
 from torchrecon.nrsfm.trajectory import trajectory
 
-__all__ = ["SOLVERS", "auto", "get_solver", "logdet", "marginal", "rigid", "trajectory"]
+__all__ = ["SOLVERS", "auto", "bmm", "csf", "em_ppca", "get_solver", "logdet", "marginal", "pta", "rigid", "trajectory"]
 
-SOLVERS: dict[str, Solver] = {"auto": auto, "logdet": logdet, "marginal": marginal, "rigid": rigid, "trajectory": trajectory}
+SOLVERS: dict[str, Solver] = {
+    "auto": auto,
+    "bmm": bmm,
+    "csf": csf,
+    "em_ppca": em_ppca,
+    "logdet": logdet,
+    "marginal": marginal,
+    "pta": pta,
+    "rigid": rigid,
+    "trajectory": trajectory,
+}
 
 
 def get_solver(name: str) -> Solver:
