@@ -1,4 +1,4 @@
-"""PCK in 3D and PCKh, and the MPII readers."""
+"""PCK in 3D and PCKh, matching of left-out points, and the MPII readers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import torch
 from torchrecon.data.mpii import MPII_JOINTS, load_mpii, load_mpii_predictions
 from torchrecon.errors import ReconError
 from torchrecon.linalg import rotation_from_vector
-from torchrecon.metrics import pck3d, pckh, similarity_align
+from torchrecon.measurement.camera import project_points
+from torchrecon.metrics import matching_degree, pck3d, pckh, place_in_view, similarity_align
 
 
 @pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
@@ -104,6 +105,10 @@ def test_unusable_annotations_name_file_row_and_key(tmp_path):
     (tmp_path / "c.json").write_text('[{"image": "a.jpg", "scale": 1}]')
     with pytest.raises(ReconError, match="person 0: has no key 'joints'"):
         load_mpii(tmp_path / "c.json")
+    person = {"image": "a.jpg", "scale": 1, "joints": [[0.0, 0.0]] * 15, "joints_vis": [1] * 16}
+    (tmp_path / "c.json").write_text(json.dumps([person]))
+    with pytest.raises(ReconError, match="person 0: joints"):
+        load_mpii(tmp_path / "c.json")
     (tmp_path / "d.json").write_text("{")
     with pytest.raises(ReconError, match="not readable"):
         load_mpii(tmp_path / "d.json")
@@ -129,3 +134,40 @@ def test_mpii_files_are_read_whole(data_dir):
     people = load_mpii(data_dir / "keypoints" / "test_mpii.json")
     assert len(people) == 5
     assert float(people.xy.isnan().all(-1).double().mean()) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_a_shape_is_placed_where_it_was_seen(generator, batch):
+    shape = torch.randn(*batch, 4, 12, 3, generator=generator)
+    shift = torch.randn(*batch, 4, 3, generator=generator) + torch.tensor([0.0, 0.0, 9.0])
+    k = torch.tensor([[500.0, 0, 320], [0, 480.0, 240], [0, 0, 1]]).expand(*batch, 3, 3)
+    xy = project_points(shape + shift[..., None, :], k[..., None, None, :, :])
+    seen = torch.rand(*batch, 4, 12, generator=generator) < 0.7
+    hidden = torch.where(seen[..., None], shape, torch.nan)
+    torch.testing.assert_close(place_in_view(hidden, xy, seen, k), shift)
+    # Twice as large is twice as far: the same picture.
+    again = place_in_view(2 * shape, xy, seen, k)
+    torch.testing.assert_close(project_points(2 * shape + again[..., None, :], k[..., None, None, :, :]), xy)
+    with pytest.raises(ReconError, match="fewer than two"):
+        place_in_view(shape, xy, torch.zeros_like(seen), k)
+
+
+def test_placing_is_the_least_squares_solution(generator):
+    shape = torch.randn(1, 9, 3, generator=generator)
+    k = torch.tensor([[500.0, 0, 320], [0, 480.0, 240], [0, 0, 1]])
+    xy = project_points(shape + torch.tensor([0.2, 0.1, 8.0]), k) + torch.randn(1, 9, 2, generator=generator)
+    n = (xy[0] - torch.tensor([320.0, 240.0])) / torch.tensor([500.0, 480.0])
+    one, zero = torch.ones(9), torch.zeros(9)
+    design = torch.cat([torch.stack([one, zero, -n[:, 0]], -1), torch.stack([zero, one, -n[:, 1]], -1)])
+    right = torch.cat([n[:, 0] * shape[0, :, 2] - shape[0, :, 0], n[:, 1] * shape[0, :, 2] - shape[0, :, 1]])
+    expected = torch.linalg.lstsq(design, right[:, None]).solution[:, 0]
+    found = place_in_view(shape, xy, torch.ones(1, 9, dtype=torch.bool), k)
+    torch.testing.assert_close(found[0], expected)
+
+
+def test_a_point_without_a_position_is_a_miss():
+    truth = torch.zeros(2, 4, 2)
+    off = torch.tensor([0.0, 2.0, 4.0, torch.nan])[:, None].expand(4, 2) / 2**0.5
+    chosen = torch.tensor([[True] * 4, [True, False, False, True]])
+    assert matching_degree(off.expand(2, 4, 2), truth, chosen).tolist() == [50.0, 50.0]
+    assert matching_degree(off.expand(2, 4, 2), truth, ~chosen).isnan().tolist() == [True, False]

@@ -12,7 +12,6 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -102,62 +101,55 @@ def load_mpii(path: str | os.PathLike[str]) -> MpiiStills:
     if not source.is_file():
         raise ReconError(f"{source}: no such file; give the MPII annotations as .csv, .csv.gz or .json")
     try:
-        people = _json_people(source) if source.suffix == ".json" else _csv_people(source)
+        stills = _json_form(source) if source.suffix == ".json" else _csv_form(source)
     except (OSError, EOFError, UnicodeDecodeError, json.JSONDecodeError, csv.Error) as error:
         raise ReconError(f"{source}: is not readable as MPII annotations ({error})") from error
-    if not people:
+    if not len(stills):
         raise ReconError(f"{source}: holds nobody")
-    xy = torch.tensor([joints for _, joints, _, _ in people], dtype=torch.float64)
-    scale = torch.tensor([size for _, _, size, _ in people], dtype=torch.float64)
-    return MpiiStills(tuple(p[0] for p in people), xy, scale, tuple(p[3] for p in people))
+    return stills
 
 
-_Person = tuple[str, list[list[float]], float, str]
-
-
-def _csv_people(source: Path) -> list[_Person]:
-    people: list[_Person] = []
+def _csv_form(source: Path) -> MpiiStills:
+    columns = ["Scale", *(f"{joint}_{axis}" for joint in MPII_JOINTS for axis in "XY")]
     with gzip.open(source, "rt", newline="") if source.suffix == ".gz" else source.open(newline="") as stream:
-        rows = csv.DictReader(stream)
-        needed = ["NAME", "Scale", "Activity", *(f"{joint}_{axis}" for joint in MPII_JOINTS for axis in "XY")]
-        for key in needed:
-            if key not in (rows.fieldnames or ()):
+        reader = csv.DictReader(stream)
+        for key in ("NAME", "Activity", *columns):
+            if key not in (reader.fieldnames or ()):
                 raise ReconError(f"{source}: has no column {key!r}; it is not the CSV form of MPII")
-        for index, row in enumerate(rows):
-            joints = []
-            for joint in MPII_JOINTS:
-                x, y = (_number(row[f"{joint}_{axis}"], f"{source}: row {index}, {joint}_{axis}") for axis in "XY")
-                # Joints may lie outside the image: only the pair -1, -1 means that there is none.
-                joints.append([float("nan")] * 2 if x == y == -1 else [x, y])
-            people.append(
-                (row["NAME"], joints, _number(row["Scale"], f"{source}: row {index}, Scale"), row["Activity"])
-            )
-    return people
+        rows = list(reader)
+    values = np.empty((len(rows), len(columns)))
+    for index, row in enumerate(rows):
+        try:
+            values[index] = [float(row[key]) for key in columns]
+        except (TypeError, ValueError) as error:  # a short row holds None
+            raise ReconError(f"{source}: row {index}: a coordinate or the scale is no number ({error})") from error
+    xy = values[:, 1:].reshape(-1, len(MPII_JOINTS), 2)
+    # Joints may lie outside the image: only the pair -1, -1 means that there is none.
+    xy = np.where((xy == -1).all(-1, keepdims=True), np.nan, xy)
+    names, activity = (tuple(row[key] for row in rows) for key in ("NAME", "Activity"))
+    return MpiiStills(names, torch.from_numpy(xy), torch.from_numpy(values[:, 0].copy()), activity)
 
 
-def _json_people(source: Path) -> list[_Person]:
+def _json_form(source: Path) -> MpiiStills:
     content = json.loads(source.read_text(encoding="utf-8"))
     if not isinstance(content, list):
         raise ReconError(f"{source}: is not the JSON form of MPII; a list of people is needed")
-    people: list[_Person] = []
+    xy, scale = np.empty((len(content), len(MPII_JOINTS), 2)), np.empty(len(content))
     for index, item in enumerate(content):
         where = f"{source}: person {index}"
         for key in ("image", "scale", "joints", "joints_vis"):
             if not isinstance(item, dict) or key not in item:
                 raise ReconError(f"{where}: has no key {key!r}")
-        joints, shown = np.asarray(item["joints"], np.float64), np.asarray(item["joints_vis"])
-        if joints.shape != (len(MPII_JOINTS), 2) or shown.shape != (len(MPII_JOINTS),):
+        try:
+            joints, shown = np.array(item["joints"], np.float64), np.array(item["joints_vis"], np.float64)
+            scale[index] = float(item["scale"])
+        except (TypeError, ValueError) as error:
+            raise ReconError(f"{where}: joints, joints_vis and scale must be numbers ({error})") from error
+        if joints.shape != xy.shape[1:] or shown.shape != joints.shape[:1]:
             raise ReconError(f"{where}: joints {joints.shape} and joints_vis {shown.shape}; 16 joints are needed")
-        kept = np.where(shown[:, None] > 0, joints, np.nan)
-        people.append((str(item["image"]), kept.tolist(), _number(item["scale"], f"{where}, scale"), ""))
-    return people
-
-
-def _number(value: Any, where: str) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError) as error:
-        raise ReconError(f"{where}: {value!r} is no number") from error
+        xy[index] = np.where(shown[:, None] > 0, joints, np.nan)
+    names = tuple(str(item["image"]) for item in content)
+    return MpiiStills(names, torch.from_numpy(xy), torch.from_numpy(scale), ("",) * len(names))
 
 
 def load_mpii_predictions(path: str | os.PathLike[str]) -> MpiiPredictions:

@@ -14,6 +14,7 @@ from torchrecon.metrics.points import (
     procrustes_disparity,
     similarity_align,
 )
+from torchrecon.metrics.reprojection import matching_degree, place_in_view
 
 __all__ = [
     "action_error",
@@ -21,12 +22,14 @@ __all__ = [
     "error3d_akhter",
     "error3d_camera",
     "error3d_camera_frameflip",
+    "matching_degree",
     "mpjpe",
     "mse",
     "nrmse",
     "pa_mpjpe",
     "pck3d",
     "pckh",
+    "place_in_view",
     "procrustes_disparity",
     "psnr",
     "similarity_align",

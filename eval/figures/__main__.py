@@ -1,0 +1,1 @@
+"""The paper's figures: ``python -m eval.figures --figure 8 9``."""
