@@ -13,12 +13,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
-from eval.job import Cache, Profile, write_json
-from eval.predict import load_row, open_caches, predict, tracks_path
+from eval.job import Cache, Profile, read_json, write_json
+from eval.predict import load_row, open_caches, predict, row_path, tracks_path
 from eval.rows import FLAT, Row, rows_of
 from eval.rows.template import save_prior, train_prior
 from eval.sequences import ACTIONS, Filmed, Filming, Sequence, make_clip, synthetic_sequences
@@ -130,6 +130,10 @@ class Solved:
         """What the tracker saw of the body, left out or not: every such entry has a truth."""
         return self.filmed.tracks.visible & self.filmed.known
 
+    def alignment(self, row: Row) -> Literal["similarity", "translation"]:
+        """What is taken out before a row is compared in 3D: an answer with measured depth has true axes and metres."""
+        return "translation" if row.uses_depth and self.filming.regime == "depth" else "similarity"
+
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -138,8 +142,7 @@ class Answer:
     Attributes:
         row: which.
         pixels: (frames, points, 2) where it would be seen; NaN where the row has no position.
-        aligned: (frames, points, 3) camera axes, metres, centred like ``truth``; zero where not ``found``.
-        truth: (frames, points, 3) camera axes, metres, centred per frame over ``found``.
+        aligned: (frames, points, 3) camera axes, metres, brought onto the truth; NaN where not ``found``.
         points3d: (frames, points, 3) as the row gave it.
         found: (frames, points) scored entries with a position.
         note: the row's own sentence.
@@ -148,15 +151,12 @@ class Answer:
     row: Row
     pixels: Float[Tensor, "frames points 2"]
     aligned: Float[Tensor, "frames points 3"]
-    truth: Float[Tensor, "frames points 3"]
     points3d: Float[Tensor, "frames points 3"]
     found: Bool[Tensor, "frames points"]
     note: str
 
 
-def solve_rows(
-    out: Path, protocol: Protocol, filming: Filming, seed: int, workers: int, fresh: bool, only_films: bool = False
-) -> Solved:
+def solve_rows(out: Path, protocol: Protocol, filming: Filming, seed: int, fresh: bool) -> Solved:
     """First pass: film the pass, hide observations, run every row; whatever is cached is kept."""
     passes = synthetic_sequences(1, protocol.frames, seed)
     sequence = next(item for item in passes if item.action == "pass")
@@ -164,21 +164,23 @@ def solve_rows(
     films, answers = open_caches(out, [sequence], filming, settings, fresh)
     hidden = Cache(out / "cache" / "hidden", {**films.config, **settings}, fresh)
     prior = answers.path("prior.npz")
-    profile = predict(films, answers, [sequence], filming, prior, (), seed, 1)
-    filmed = Filmed.load(tracks_path(films.folder, sequence.name))
+    film_place = tracks_path(films.folder, sequence.name)
+    if not film_place.is_file():
+        predict(films, answers, [sequence], filming, prior, (), seed, 1)  # a single film: one worker
+    filmed = Filmed.load(film_place)
     given, left_out = hide(filmed.tracks, protocol, seed)
     rows = tuple(row for row in rows_of(filming.regime) if row.solve is not None)
     place = tracks_path(hidden.folder, sequence.name)
     if not place.is_file():
         write_json(hidden.path("times", f"{sequence.name}.json"), {})
         replace(filmed, tracks=given).save(place)
-    if not only_films:
-        if not prior.is_file():
-            with profile("shape prior (Ref. 4)"):
-                save_prior(prior, train_prior(ACTIONS, protocol.prior_bodies, seed=seed))
-        for row in rows:  # one at a time, so that a killed run loses one row at most and two can share the cores
-            predict(hidden, answers, [sequence], filming, prior, (row.key,), seed, workers)
-        profile.merge(predict(hidden, answers, [sequence], filming, prior, (), seed, 1))
+    profile = Profile(read_json(films.path("times", f"{sequence.name}.json")))
+    if not prior.is_file():
+        with profile("shape prior (Ref. 4)"):
+            save_prior(prior, train_prior(ACTIONS, protocol.prior_bodies, seed=seed))
+    if not all(row_path(answers.folder, row.key, sequence.name).is_file() for row in rows):
+        predict(hidden, answers, [sequence], filming, prior, tuple(row.key for row in rows), seed, 1)
+    profile.merge(Profile(read_json(answers.path("times", f"{sequence.name}.json"))))
     stature = make_clip(sequence, filming).body.stature
     config = {**films.config, **answers.config}
     return Solved(
@@ -206,10 +208,13 @@ def answers_of(solved: Solved) -> tuple[list[Answer], dict[str, str]]:
         shift = place_in_view(points, given.xy, given.visible & finite, intrinsics)
         pixels = project_points(points + shift[:, None], intrinsics)
         found = scored & finite
-        aligned, target = similarity_align(points, truth, found)
-        if row.uses_depth and solved.filming.regime == "depth":
+        if solved.alignment(row) == "similarity":
+            aligned = similarity_align(points, truth, found)[0]
+        else:
             aligned = centre_visible(points, found)
-        found_answers.append(Answer(row, pixels, aligned, target, points, found, output.note))
+        aligned = aligned + (truth - centre_visible(truth, found))  # where found: the centre of the truth
+        aligned = torch.where(found[..., None], aligned, torch.nan)
+        found_answers.append(Answer(row, pixels, aligned, points, found, output.note))
     return found_answers, refusals
 
 

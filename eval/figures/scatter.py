@@ -5,7 +5,7 @@ protocol has it: ``turn`` degrees about the vertical in all, while the view nods
 image coordinates about their centre over the noise variance per coordinate. Pro-D is the disparity M^2 of
 ``procrustes_disparity`` with one depth sign per sequence, since parallel views leave the mirror open.
 
-The floor is what least squares makes of the same noisy tracks when all rotations are known and the body is rigid.
+The floor is the error that least squares makes of the same noise when all rotations are known and the body is rigid.
 """
 
 from __future__ import annotations
@@ -137,7 +137,8 @@ def _solve(work: tuple[Cell, str]) -> None:
     xy, sigma = noisy_views(truth, cell)
     eye = torch.eye(2, dtype=xy.dtype)
     tracks = tr.Tracks(xy + 300, covariance=(sigma**2 * eye).expand(*xy.shape[:2], 2, 2))
-    floor = known_rotation_shape(xy, rotations) @ rotations.mT
+    # The solve is linear, so what it makes of the noise alone is its error, whatever the body does.
+    floor = truth + known_rotation_shape(xy - truth[..., :2], rotations) @ rotations.mT
     arrays: dict[str, Any] = {"truth": truth, "floor": floor}
     try:
         answer = tr.reconstruct(tracks, solver=cell.solver, generator=torch.Generator().manual_seed(cell.seed))
