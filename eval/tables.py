@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,8 @@ PAPER: dict[int, dict[str, tuple[float, ...]]] = {
     },
 }
 """Tables 2 to 5 as printed: the three reference frames, in Table 2 the accuracy after them."""
+NOTHING = Row("nothing", "an empty picture")
+"""The zero of Tables 3 to 5: most of a picture is background, so what no point at all scores must be known."""
 SSIM_TARGET = {"input": 0.93, "side": 0.85, "top": 0.85}
 
 
@@ -122,28 +125,41 @@ def score(solved: Solved) -> list[dict[str, Any]]:
         raise ValueError("films have intrinsics")
     image = project_points(truth, intrinsics.double())
     chosen = solved.left_out & solved.filmed.known
-    frames = solved.protocol.scored
-    results = []
-    for answer in answers:
-        points, aligned = torch.nan_to_num(answer.points3d), solved.alignment(answer.row)
-        covered = float(answer.found.sum() / solved.scored.sum())
-        near = pck3d(points, truth, answer.found, align=aligned, stature=solved.stature)
-        figures: dict[str, Any] = {
-            "matching": matching_degree(answer.pixels, image, chosen)[frames].tolist(),
-            "accuracy": covered * float(near),  # an entry without a position is a miss
-            "error3d_camera": float(error3d_camera(points, truth, answer.found, align_scale="sequence")),
-            "alignment": aligned,
-            "covered": covered,
-        }
-        for name, metric in (("mse", mse), ("psnr", psnr), ("ssim", ssim)):
-            figures[name] = {view: [] for view in VIEWS}
-            for frame in frames:
-                pictures = view_pictures(solved, answer, frame)
-                for view, (row, true) in zip(VIEWS, pictures, strict=True):
-                    figures[name][view].append(float(metric(row, true)))
-        results.append(_row(answer.row, answer.note) | figures)
+    results = [_figures(solved, answer, image, chosen) for answer in answers]
     by_key = {row.key: row for row in solved.rows}
-    return results + [_row(by_key[key], f"no answer: {note}") for key, note in refusals.items()]
+    results += [_row(by_key[key], f"no answer: {note}") for key, note in refusals.items()]
+    if answers:
+        first = answers[0]
+        nowhere = {name: torch.full_like(getattr(first, name), torch.nan) for name in ("pixels", "aligned", "points3d")}
+        empty = replace(first, **nowhere, row=NOTHING, found=torch.zeros_like(first.found), note="no point is drawn")
+        results.append(_row(NOTHING, empty.note) | _picture_figures(solved, empty, image, chosen))
+    return results
+
+
+def _figures(solved: Solved, answer: Answer, image: Tensor, chosen: Tensor) -> dict[str, Any]:
+    """Everything about one row; ``image``: true pixels, ``chosen``: left-out points of the body."""
+    truth = torch.nan_to_num(solved.filmed.truth.double())
+    points, aligned = torch.nan_to_num(answer.points3d), solved.alignment(answer.row)
+    covered = float(answer.found.sum() / solved.scored.sum())
+    near = pck3d(points, truth, answer.found, align=aligned, stature=solved.stature)
+    return {
+        **_row(answer.row, answer.note),
+        "accuracy": covered * float(near),  # an entry without a position is a miss
+        "error3d_camera": float(error3d_camera(points, truth, answer.found, align_scale="sequence")),
+        "alignment": aligned,
+        "covered": covered,
+        **_picture_figures(solved, answer, image, chosen),
+    }
+
+
+def _picture_figures(solved: Solved, answer: Answer, image: Tensor, chosen: Tensor) -> dict[str, Any]:
+    """What is read off the image plane and the three views, at every scored frame."""
+    frames = solved.protocol.scored
+    pictures = [view_pictures(solved, answer, frame) for frame in frames]
+    figures: dict[str, Any] = {"matching": matching_degree(answer.pixels, image, chosen)[frames].tolist()}
+    for name, metric in (("mse", mse), ("psnr", psnr), ("ssim", ssim)):
+        figures[name] = {view: [float(metric(*pair[v])) for pair in pictures] for v, view in enumerate(VIEWS)}
+    return figures
 
 
 def _row(row: Row, note: str) -> dict[str, Any]:
@@ -172,7 +188,7 @@ def table_text(number: int, result: Mapping[str, Any]) -> str:
     frames, reference = result["frames"], result["reference"]
     at = [frames.index(frame) for frame in reference]
     digits = {2: 1, 3: 2, 4: 3, 5: 4}[number]
-    rows = [row for row in result["rows"] if NAMES[number] in row]
+    rows = [row for row in result["rows"] if NAMES[number] in row and (number != 2 or "accuracy" in row)]
     lines = [result["title"], "", DEFINITION[number]]
     lines.append(
         f"Columns 1 to 3: frames {', '.join(map(str, reference))}; range: over frames {frames[0]} to {frames[-1]}."
@@ -184,13 +200,13 @@ def table_text(number: int, result: Mapping[str, Any]) -> str:
         cells = "".join(f"{value:>{width}.{digits}f}" for _, value in _columns(number, row, at))
         paper = ", ".join(f"{value:.2f}" for value in PAPER[number].get(row["key"], ()))
         lines.append(f"{row['label']:<28}{cells}   {paper or '-'}")
-    refused = [f"{row['label']}: {row['note']}" for row in result["rows"] if NAMES[number] not in row]
+    refused = [f"{row['label']}: {row['note']}" for row in result["rows"] if row["note"].startswith("no answer")]
     return "\n".join([*lines, "", *refused, *_verdicts(number, rows, at)]) + "\n"
 
 
 def _verdicts(number: int, rows: list[Mapping[str, Any]], at: list[int]) -> list[str]:
     """Where the default is best, by how much it is not, and what of the targets it meets."""
-    cells = {row["key"]: _columns(number, row, at) for row in rows}
+    cells = {row["key"]: _columns(number, row, at) for row in rows if row["key"] != NOTHING.key}
     if "default" not in cells:
         return []
     better = max if number != 5 else min
