@@ -125,6 +125,11 @@ def score(solved: Solved) -> list[dict[str, Any]]:
         raise ValueError("films have intrinsics")
     image = project_points(truth, intrinsics.double())
     chosen = solved.left_out & solved.filmed.known
+    for frame in solved.protocol.scored:
+        if not chosen[frame].any():
+            raise ReconError(
+                f"{solved.sequence.name}: no point of the body is left out of frame {frame}; use more tracks"
+            )
     results = [_figures(solved, answer, image, chosen) for answer in answers]
     by_key = {row.key: row for row in solved.rows}
     results += [_row(by_key[key], f"no answer: {note}") for key, note in refusals.items()]
