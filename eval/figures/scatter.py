@@ -26,6 +26,7 @@ from torchrecon.data.synthetic import SyntheticClip, sample_body, sample_motion,
 from torchrecon.errors import ReconError
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.metrics import procrustes_disparity, similarity_align
+from torchrecon.render.raycast import local_to_outer
 
 __all__ = ["Cell", "deflection_cells", "grid_cells", "known_rotation_shape", "measure", "target_lines", "turned_body"]
 
@@ -93,8 +94,9 @@ def turned_body(cell: Cell) -> tuple[Float[Tensor, "frames points 3"], Float[Ten
     g = torch.Generator().manual_seed(970_000_000 + cell.seed)
     body = sample_body(g)
     motion = sample_motion("pass", body, frames=cell.frames, fps=cell.frames / _SECONDS, generator=g)
-    clip = SyntheticClip(body, motion, static_camera(motion, generator=g), seed=cell.seed)
-    points = _EXTENT * clip.trajectory(clip.sample_surface(POINTS, g))[0].double()
+    skin = SyntheticClip(body, motion, static_camera(motion, generator=g), seed=cell.seed).sample_surface(POINTS, g)
+    world = local_to_outer(body.place(motion.joints.double(), motion.bones.double()), skin.part, skin.local.double())
+    points = _EXTENT * world * world.new_tensor([1.0, -1.0, -1.0])  # y up, facing z -> y down, z away
     if cell.body == "rigid":
         points = points[:1].expand(cell.frames, -1, -1)
     points = points - points.mean(1, keepdim=True)
