@@ -23,6 +23,7 @@ from eval.rows import FLAT, Row, rows_of
 from eval.rows.template import save_prior, train_prior
 from eval.sequences import ACTIONS, Filmed, Filming, Sequence, make_clip, synthetic_sequences
 from torchrecon._typing import Bool, Float, Tensor
+from torchrecon.errors import ReconError
 from torchrecon.measurement import Tracks
 from torchrecon.measurement.camera import project_points
 from torchrecon.metrics import centre_visible, place_in_view, similarity_align
@@ -130,6 +131,18 @@ class Solved:
         """What the tracker saw of the body, left out or not: every such entry has a truth."""
         return self.filmed.tracks.visible & self.filmed.known
 
+    @property
+    def truth(self) -> Float[Tensor, "frames points 3"]:
+        """Camera axes, metres, double precision; zero for tracks that are not on the body."""
+        return torch.nan_to_num(self.filmed.truth.double())
+
+    @property
+    def intrinsics(self) -> Float[Tensor, "3 3"]:
+        """Of the film, double precision."""
+        if self.given.intrinsics is None:
+            raise ReconError(f"{self.sequence.name}: the film has no intrinsics; film it again with --fresh")
+        return self.given.intrinsics.double()
+
     def alignment(self, row: Row) -> Literal["similarity", "translation"]:
         """What is taken out before a row is compared in 3D: an answer with measured depth has true axes and metres."""
         return "translation" if row.uses_depth and self.filming.regime == "depth" else "similarity"
@@ -191,10 +204,7 @@ def solve_rows(out: Path, protocol: Protocol, filming: Filming, seed: int, fresh
 def answers_of(solved: Solved) -> tuple[list[Answer], dict[str, str]]:
     """Second pass: every row's answer, placed and aligned; and the sentences of rows that have none."""
     given, scored = solved.given.to(dtype=torch.float64), solved.scored
-    truth = torch.nan_to_num(solved.filmed.truth.double())
-    intrinsics = given.intrinsics
-    if intrinsics is None:
-        raise ValueError("films have intrinsics")
+    truth, intrinsics = solved.truth, solved.intrinsics
     found_answers, refusals = [], {}
     for row in solved.rows:
         output = load_row(solved.answers, row.key, solved.sequence.name)

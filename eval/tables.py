@@ -89,13 +89,10 @@ def view_pictures(solved: Solved, answer: Answer, frame: int) -> list[Float[Tens
 
     A point without a position is not drawn. The person's box is that of all true points, seen or not.
     """
-    truth = solved.filmed.truth[frame].double()
-    intrinsics = solved.given.intrinsics
-    if intrinsics is None:
-        raise ValueError("films have intrinsics")
-    focal = float(intrinsics[0, 0])
+    truth = solved.truth[frame]
     chosen = solved.left_out[frame] & solved.filmed.known
-    image = project_points(truth, intrinsics.double())
+    image = project_points(truth, solved.intrinsics)
+    focal = float(solved.intrinsics[0, 0])
     pixel = RASTER / solved.stature * float(truth[solved.filmed.known, 2].mean()) / focal
     metre = RASTER / solved.stature
     aligned = answer.aligned[frame]
@@ -119,11 +116,7 @@ def view_pictures(solved: Solved, answer: Answer, frame: int) -> list[Float[Tens
 def score(solved: Solved) -> list[dict[str, Any]]:
     """What every cached answer is worth at every scored frame; everything that Tables 2 to 5 print."""
     answers, refusals = answers_of(solved)
-    truth = torch.nan_to_num(solved.filmed.truth.double())
-    intrinsics = solved.given.intrinsics
-    if intrinsics is None:
-        raise ValueError("films have intrinsics")
-    image = project_points(truth, intrinsics.double())
+    image = project_points(solved.truth, solved.intrinsics)
     chosen = solved.left_out & solved.filmed.known
     for frame in solved.protocol.scored:
         if not chosen[frame].any():
@@ -143,8 +136,7 @@ def score(solved: Solved) -> list[dict[str, Any]]:
 
 def _figures(solved: Solved, answer: Answer, image: Tensor, chosen: Tensor) -> dict[str, Any]:
     """Everything about one row; ``image``: true pixels, ``chosen``: left-out points of the body."""
-    truth = torch.nan_to_num(solved.filmed.truth.double())
-    points, aligned = torch.nan_to_num(answer.points3d), solved.alignment(answer.row)
+    truth, points, aligned = solved.truth, torch.nan_to_num(answer.points3d), solved.alignment(answer.row)
     covered = float(answer.found.sum() / solved.scored.sum())
     near = pck3d(points, truth, answer.found, align=aligned, stature=solved.stature)
     return {

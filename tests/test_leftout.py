@@ -44,7 +44,7 @@ def make_solved(folder: Path, regime: str = "turning") -> tuple[Solved, torch.Te
     filmed = Filmed(tracks, eye, torch.where(known[:, None], truth, torch.nan), known, turn)
     given, left_out = hide(tracks, PROTOCOL, seed=0)
     solved = Solved(
-        filmed, given, left_out, folder, synthetic_sequences(1, FRAMES)[3], Filming(regime=regime), PROTOCOL,  # type: ignore[arg-type]
+        filmed, given, left_out, folder, synthetic_sequences(1, FRAMES)[3], Filming(regime=regime), PROTOCOL,
         tuple(row for row in ROWS if row.key in ("default", "rigid", "flat", "ref5", "ref6")), 1.80, Profile(), {},
     )  # fmt: skip
     centred = truth - truth.mean(1, keepdim=True)

@@ -69,7 +69,8 @@ def run(arguments: argparse.Namespace, out: Path) -> tuple[dict[str, Any], list[
     text: list[str] = []
     film = _film(arguments) if OF_THE_FILM & set(wanted) else None
     for figure in wanted:
-        path, lines = out / f"figure{figure}.png", []
+        path = out / f"figure{figure}.png"
+        lines: list[str] = []
         if figure == 1:
             numbers["1"] = pictures.draw_graph(path)
         elif figure == 3:

@@ -88,7 +88,7 @@ _VIEWS = {"front": (0, 1), "side": (2, 1), "top": (0, 2)}
 
 def _body_frame(solved: Solved, answer: Answer, frame: int) -> tuple[Tensor, Tensor, Bool[Tensor, " points"]]:
     """Points of the row and of the truth about the middle of the true body, and those that both have."""
-    truth = solved.filmed.truth[frame].double()
+    truth = solved.truth[frame]
     middle = truth[solved.filmed.known].mean(0)
     return answer.aligned[frame] - middle, truth - middle, answer.found[frame]
 
@@ -153,14 +153,11 @@ def draw_reference(solved: Solved, path: Path) -> dict[str, Any]:
     clip = make_clip(solved.sequence, solved.filming)
     frames = solved.protocol.reference
     figure, axes = _figure(12, 3.4, 1, len(frames))
-    intrinsics = solved.given.intrinsics
-    if intrinsics is None:
-        raise ValueError("films have intrinsics")
     counts = []
     for number, (ax, frame) in enumerate(zip(axes[0], frames, strict=True), 1):
         _show(ax, clip.render(frame).rgb)
         seen, left = solved.given.visible[frame], solved.left_out[frame] & solved.filmed.known
-        pixels = project_points(solved.filmed.truth[frame].double(), intrinsics.double())
+        pixels = project_points(solved.truth[frame], solved.intrinsics)
         ax.scatter(*solved.given.xy[frame, seen].T, s=3, c="white")
         ax.scatter(*pixels[left].T, s=12, facecolors="none", edgecolors="red")
         ax.set_title(f"({number}) frame {frame}")
