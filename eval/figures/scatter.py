@@ -161,8 +161,9 @@ def measure(cells: Sequence[Cell], out: Path, workers: int, fresh: bool) -> list
     """Both passes: solve what is not cached, then score every cell from the cache.
 
     Returns:
-        For each cell its fields, ``disparity`` (None without an answer), ``floor``, ``rank`` and ``note``, and the
-        arrays ``points3d`` and ``truth`` aligned by one similarity for the sequence.
+        For each cell its fields, ``disparity`` (per frame, then the mean; None without an answer) and its ``root``,
+        ``disparity_sequence`` (one similarity for all frames), ``floor``, ``rank`` and ``note``, and the arrays
+        ``points3d`` and ``truth``, aligned by that one similarity.
     """
     config = {"code": source_digest("torchrecon", "eval/figures/scatter.py")}
     cache = Cache(out / "cache" / "scatter", config, fresh)
@@ -178,8 +179,11 @@ def measure(cells: Sequence[Cell], out: Path, workers: int, fresh: bool) -> list
         record["floor"] = float(procrustes_disparity(torch.from_numpy(arrays["floor"]), truth))
         if "points3d" in arrays:
             points = with_best_sign(torch.from_numpy(arrays["points3d"]), truth)
-            record |= {"rank": int(arrays["rank"]), "disparity": float(procrustes_disparity(points, truth))}
-            record["points3d"] = similarity_align(points, truth)[0]
+            aligned = similarity_align(points, truth)[0]
+            disparity = float(procrustes_disparity(points, truth))
+            record |= {"rank": int(arrays["rank"]), "disparity": disparity, "root": math.sqrt(disparity)}
+            record["disparity_sequence"] = float((aligned - truth).square().sum() / truth.square().sum())
+            record["points3d"] = aligned
         records.append(record)
     return records
 
