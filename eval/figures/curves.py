@@ -63,22 +63,28 @@ def draw_scatter(records: Sequence[dict[str, Any]], path: Path) -> None:
     """Figure 8: true (grey) and reconstructed (blue) scattering points of the middle frame, one panel per cell."""
     from matplotlib.figure import Figure
 
-    columns = len(dict.fromkeys(r["turn"] for r in records))
-    rows = math.ceil(len(records) / columns)
-    figure = Figure(figsize=(3 * columns, 3 * rows), layout="constrained")
-    for place, record in enumerate(records, 1):
-        ax = figure.add_subplot(rows, columns, place, projection="3d")
-        middle = record["frames"] // 2
-        x, y, z = record["truth"][middle].T
-        ax.scatter(x, z, -y, s=8, c="0.6")
-        error = "no answer"
-        if record["disparity"] is not None:
-            x, y, z = record["points3d"][middle].T
-            ax.scatter(x, z, -y, s=8, c="tab:blue")
-            error = f"M^2 {record['disparity']:.1e}"
-        step = record["turn"] / (record["frames"] - 1)
-        ax.set_title(f"{record['turn']:g} deg, {step:.2g} a frame, F {record['frames']}: {error}", size=7)
-        ax.tick_params(labelsize=5)
+    turns = list(dict.fromkeys(r["turn"] for r in records))
+    columns = [[r for r in records if r["turn"] == turn] for turn in turns]
+    rows = max(len(column) for column in columns)
+    half = 1.05 * max(float(record["truth"].abs().max()) for record in records)
+    figure = Figure(figsize=(2.6 * len(turns), 3.6 * rows), layout="constrained")
+    for c, column in enumerate(columns):
+        for r, record in enumerate(column):
+            ax: Any = figure.add_subplot(rows, len(turns), r * len(turns) + c + 1, projection="3d")
+            middle = record["frames"] // 2
+            x, y, z = record["truth"][middle].T
+            ax.scatter(x, z, -y, s=8, c="0.6")
+            error = "no answer"
+            if record["disparity"] is not None:
+                x, y, z = record["points3d"][middle].T
+                ax.scatter(x, z, -y, s=8, c="tab:blue")
+                error = f"M^2 {record['disparity']:.1e}"
+            # One scale on all axes, or a shape without depth would look like a body.
+            ax.set(xlim=(-half / 2, half / 2), ylim=(-half / 2, half / 2), zlim=(-half, half))
+            ax.set_box_aspect((1, 1, 2))
+            step = record["turn"] / (record["frames"] - 1)
+            ax.set_title(f"{record['turn']:g} deg, {step:.2g} a frame, F {record['frames']}\n{error}", size=7)
+            ax.tick_params(labelsize=5)
     save_figure(figure, path)
 
 
