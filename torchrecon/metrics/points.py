@@ -24,6 +24,7 @@ __all__ = [
     "nrmse",
     "pa_mpjpe",
     "procrustes_disparity",
+    "similarity_align",
 ]
 
 
@@ -203,6 +204,32 @@ def pa_mpjpe(
     estimate, target, mask = _pair(points3d, truth, visible)
     distance = (_similarity(estimate, target) - target).square().sum(-1).sqrt()
     return distance.sum((-1, -2)) / mask.sum((-1, -2)).clamp_min(1)
+
+
+def similarity_align(
+    points3d: Float[Tensor, "*batch frames points 3"],
+    truth: Float[Tensor, "*batch frames points 3"],
+    visible: Bool[Tensor, "*batch frames points"] | None = None,
+) -> tuple[Float[Tensor, "*batch frames points 3"], Float[Tensor, "*batch frames points 3"]]:
+    """Bring a whole sequence onto the truth by one rotation and one scale, after centring per frame.
+
+    Alignment: centring per frame, one least-squares similarity per sequence. Reflection: never.
+
+    Returns:
+        aligned, target: both centred per frame over the entries that count; zero elsewhere.
+
+    Example:
+        >>> import torch
+        >>> shape = torch.randn(4, 6, 3, generator=torch.Generator().manual_seed(0))
+        >>> turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        >>> aligned, target = similarity_align(3 * shape @ turn + 1, shape)
+        >>> bool(torch.allclose(aligned, target, atol=1e-5))
+        True
+    """
+    estimate, target, _ = _pair(points3d, truth, visible)
+    # One similarity of a sequence is that of a single frame which holds the points of all frames.
+    aligned = _similarity(estimate.flatten(-3, -2), target.flatten(-3, -2))
+    return aligned.unflatten(-2, estimate.shape[-3:-1]), target
 
 
 def procrustes_disparity(

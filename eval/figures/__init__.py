@@ -1,0 +1,1 @@
+"""The paper's figures, one command: ``python -m eval.figures --figure 1 2 ...``."""
