@@ -9,6 +9,7 @@ from torchrecon.cli.examples import EXAMPLES
 
 __all__ = ["build_parser"]
 
+
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = argparse.ArgumentParser(

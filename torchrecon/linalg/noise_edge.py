@@ -14,7 +14,14 @@ import torch
 
 from torchrecon._typing import Float, Tensor
 
-__all__ = ["complement_basis", "count_signals", "kritchman_nadler_noise", "marchenko_pastur_tail", "spectrum", "tracy_widom_edge"]
+__all__ = [
+    "complement_basis",
+    "count_signals",
+    "kritchman_nadler_noise",
+    "marchenko_pastur_tail",
+    "spectrum",
+    "tracy_widom_edge",
+]
 
 # quantiles of the Tracy-Widom distribution for real matrices
 TRACY_WIDOM = {0.5: -1.2686, 0.95: 0.9793, 0.995: 2.4224, 0.999: 3.2724}

@@ -9,19 +9,18 @@ The model is in ``shape_likelihood``; the search is derived here.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
-from torchrecon.linalg.noise_edge import marchenko_pastur_tail
 from torchrecon.linalg.missing_factors import fit_factors, grow_factors, start_factors
+from torchrecon.linalg.noise_edge import marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
-from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
@@ -101,7 +100,13 @@ def _rigid_model(xy: Tensor, rotations: Tensor) -> ShapeModel:
     rows = rotations[:, :, :2].flatten(1, 2)
     stack = (xy - xy.mean(1, keepdim=True)).mT.flatten(0, 1)
     mean = (torch.linalg.pinv(rows.mT @ rows) @ (rows.mT @ stack)).mT
-    return ShapeModel(rotations, torch.ones_like(rotations[..., 0, 0]), mean, mean.new_zeros(*mean.shape, 0), torch.linalg.qr(tangents(mean))[0])
+    return ShapeModel(
+        rotations,
+        torch.ones_like(rotations[..., 0, 0]),
+        mean,
+        mean.new_zeros(*mean.shape, 0),
+        torch.linalg.qr(tangents(mean))[0],
+    )
 
 
 def solve_marginal(
@@ -135,37 +140,50 @@ def solve_marginal(
                 break
             eps, level, before = eps * fall, level + 1, modes
         answer = evaluate(views, views.whitener(eps)[None], model, eps)
-    return _reconstruction(data, model, answer, eps, rank, bool(converged), len(rotations), params).to(dtype=dtype)
+        status = _status(data, rank, model.rotations[0], converged, len(rotations))
+        return _reconstruction(data, model, answer, eps, rank, status).to(dtype=dtype)
 
 
-def _reconstruction(data, model, answer, eps, rank, converged, tried, params):  # type: ignore[no-untyped-def]
-    points3d, rotations, scale = answer.points[0], model.rotations[0], model.scale[0]
-    covariance = answer.spread[0] @ answer.spread[0].mT
-    plane = torch.diag_embed(torch.ones_like(points3d)) * eps**2
-    scale = torch.ones_like(scale)
+def _reconstruction(
+    data: Observations, model: ShapeModel, answer: Evaluation, eps: float, rank: int, status: Status
+) -> Reconstruction:
+    """The posterior mean of the shapes as seen, in the container's units.
+
+    What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in pixels of
+    the tracks in every frame.
+    """
+    points3d, rotations = answer.points[0], model.rotations[0]
+    # Weights and translation leave the spread, the residual an isotropic rest that the image measures in two axes.
+    residual = points3d.new_tensor([0.0, 0.0, eps**2]).diag()
+    covariance = answer.spread[0] @ answer.spread[0].mT + residual
     flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
-    flip[2] = mirror_sign(points3d - points3d.mean(-2, keepdim=True))
+    flip[2] = mirror_sign(points3d)
     both = flip[:, None] * flip
-    turn = float(turn_of_view(rotations))
-    status = check_size(data.tracks, rank)
-    static = turn < STATIC_TURN or (bool(data.visible.all()) and looks_static(data.xy - data.xy.mean(1, keepdim=True)))
-    if status is None and static:
-        status = Status(
-            "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
-        )
-    if status is None and not converged:
-        status = Status("not_converged", "the likelihood still rose when the steps were spent")
-    if status is None:
-        status = Status("ok", f"likeliest of {tried} starts, view turning by {turn:.0f} degrees")
     return data.reconstruction(
         points3d * flip,
         rotations * both,
-        scale,
+        torch.ones_like(model.scale[0]),
         answer.translation[0],
         rank=rank,
         status=status,
-        covariance3d=(covariance + plane) * both,
+        covariance3d=covariance * both,
     )
+
+
+def _status(data: Observations, rank: int, rotations: Tensor, converged: bool, tried: int) -> Status:
+    """What the answer is worth, in words."""
+    turn = float(turn_of_view(rotations))
+    small = check_size(data.tracks, rank)
+    if small is not None:
+        return small
+    complete = bool(data.visible.all())
+    if turn < STATIC_TURN or (complete and looks_static(data.xy - data.xy.mean(1, keepdim=True))):
+        return Status(
+            "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
+        )
+    if not converged:
+        return Status("not_converged", f"the likelihood still rose after the last step from the best of {tried} starts")
+    return Status("ok", f"likeliest of {tried} starts, view turning by {turn:.0f} degrees")
 
 
 def marginal(

@@ -7,6 +7,7 @@ curvature pairs and the line search are per item; an item never waits for the li
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -45,19 +46,22 @@ def _dot(a: Direction, b: Direction) -> Tensor:
 
 
 def _add(a: Direction, factor: Tensor, b: Direction) -> Direction:
-    wide = [factor.view(-1, *[1] * (x.ndim - 1)) for x in a]
-    return tuple(x + w * y for x, w, y in zip(a, wide, b, strict=True))  # type: ignore[return-value]
+    """``a + factor * b`` with one factor per item."""
+    pose, mean, loadings = (x + factor.view(-1, *[1] * (x.ndim - 1)) * y for x, y in zip(a, b, strict=True))
+    return pose, mean, loadings
 
 
-def _choose(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    return torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b)
+def _scaled(factor: Tensor, a: Direction) -> Direction:
+    """``a`` with one factor per item."""
+    pose, mean, loadings = (factor.view(-1, *[1] * (x.ndim - 1)) * x for x in a)
+    return pose, mean, loadings
 
 
 def _gradient(at: Evaluation) -> Direction:
     return at.pose, at.mean, at.loadings
 
 
-def _metric(model: ShapeModel, fisher: Tensor, residual: Tensor):  # type: ignore[no-untyped-def]
+def _metric(model: ShapeModel, fisher: Tensor, residual: Tensor) -> Callable[[Direction], Direction]:
     """The inverse information of poses, mean and loadings, as a function on gradients."""
     frames, modes = model.scale.shape[-1], model.loadings.shape[-1]
     eye = torch.eye(4, dtype=fisher.dtype, device=fisher.device)
@@ -108,14 +112,14 @@ def descend(
         # A direction that does not descend starts the memory of its item anew.
         lost = slope >= 0
         if bool(lost.any()):
-            plain = metric(_gradient(now))
-            q = tuple(_choose(lost, a, b) for a, b in zip(plain, q, strict=True))  # type: ignore[assignment]
+            share = lost.to(slope.dtype)
+            q = _add(_scaled(1 - share, q), share, metric(_gradient(now)))
             slope = -_dot(q, _gradient(now))
             pairs = [(s, c, torch.where(lost, torch.zeros_like(w), w)) for s, c, w in pairs]
         turn = q[0][..., :3].norm(dim=-1).amax(-1)
         length = torch.where(done, torch.zeros_like(turn), (params.turn / turn.clamp_min(1e-300)).clamp_max(1.0))
         for _ in range(params.halvings):
-            step = _add(tuple(torch.zeros_like(x) for x in q), -length, q)  # type: ignore[arg-type]
+            step = _scaled(-length, q)
             trial = moved(model, *step)
             then = evaluate(views, whitener, trial, eps)
             good = (then.value <= now.value + params.sufficient * length * slope) | (length == 0)
@@ -124,7 +128,7 @@ def descend(
             length = torch.where(good, length, 0.4 * length)
         length = torch.where(good, length, torch.zeros_like(length))
         if not bool(good.all()):
-            step = _add(tuple(torch.zeros_like(x) for x in q), -length, q)  # type: ignore[arg-type]
+            step = _scaled(-length, q)
             trial = moved(model, *step)
             then = evaluate(views, whitener, trial, eps)
         change = _add(_gradient(then), -torch.ones_like(length), _gradient(now))

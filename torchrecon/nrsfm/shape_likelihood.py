@@ -148,9 +148,7 @@ def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float) -> E
     basis = basis.transpose(-3, -2)
     x, y, z = placed.flatten(-2).unbind(-2)
     gx, gy = stacked.unbind(-2)
-    pose = torch.stack(
-        [-(gy * z).sum(-1), (gx * z).sum(-1), (gy * x - gx * y).sum(-1), (gx * x + gy * y).sum(-1)], -1
-    )
+    pose = torch.stack([-(gy * z).sum(-1), (gx * z).sum(-1), (gy * x - gx * y).sum(-1), (gx * x + gy * y).sum(-1)], -1)
     pose[..., 3] -= pose[..., 3].mean(-1, keepdim=True)
     mean, loadings = basis[..., 0], basis[..., 1:]
     flat = loadings.flatten(-3, -2)
@@ -175,14 +173,10 @@ def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float) -> E
     seen_jacobian = (whitener @ jacobian).flatten(-3, -2)
     explained = torch.linalg.solve_triangular(factor, design.mT @ seen_jacobian, upper=False)
     fisher = seen_jacobian.mT @ seen_jacobian - explained.mT @ explained
-    return Evaluation(
-        value, pose, mean - mean.mean(-2, keepdim=True), loadings, fisher, points, spread, translation
-    )
+    return Evaluation(value, pose, mean - mean.mean(-2, keepdim=True), loadings, fisher, points, spread, translation)
 
 
-def grow_loadings(
-    views: Views, whitener: Tensor, model: ShapeModel, eps: float, most: int
-) -> ShapeModel:
+def grow_loadings(views: Views, whitener: Tensor, model: ShapeModel, eps: float, most: int) -> ShapeModel:
     """One step of expectation-maximisation for mean and loadings: principal directions of the expected covariance.
 
     Directions whose variance exceeds that of the residual become modes, at most ``most``: the number of modes finds
