@@ -32,7 +32,7 @@ def complete_in_bash(*words: str) -> set[str]:
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 def test_bash_completes_commands_options_and_choices():
-    assert complete_in_bash("torchrecon", "re") == {"reconstruct"}
+    assert complete_in_bash("torchrecon", "rec") == {"reconstruct"}
     assert {"solve", "rank", "doctor", "--help"} <= complete_in_bash("torchrecon", "")
     assert complete_in_bash("torchrecon", "rank", "t.npz", "--l") == {"--layout"}
     assert complete_in_bash("torchrecon", "rank", "--layout", "") == {"vector", "stack"}

@@ -149,6 +149,14 @@ def test_too_few_points_end_in_a_status(name):
         assert "at least 13 points" in rec.status.text
 
 
+@pytest.mark.parametrize("name", ["auto", "logdet", "marginal"])
+def test_float32_tracks_are_solved_and_stay_float32(name):
+    truth = _world(rank=2, frames=24, points=12)
+    rec = get_solver(name)(Tracks(truth[..., :2].float()), 2)
+    assert rec.points3d.dtype == rec.rotations.dtype == torch.float32
+    assert error3d_camera(rec.points3d.double(), truth) < 0.05
+
+
 def test_iteration_limit_is_reported():
     truth = _world(rank=2)
     params = LowRankParams(short_iterations=1, long_iterations=1)

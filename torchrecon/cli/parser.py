@@ -61,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
     batch.add_argument("--force", action="store_true", help="replace the results of a batch with other settings")
 
     report = _command(commands, "report", "page to look at a reconstruction, one file that works offline")
-    report.add_argument("reconstruction", metavar="RECON.npz")
+    report.add_argument("reconstruction", metavar="RECON.npz", help="what solve and reconstruct write")
     report.add_argument("-o", "--out", required=True, metavar="report.html", help="replaced atomically")
     report.add_argument("--tracks", metavar="TRACKS.npz", help="the tracks it was made from: gaps, confidence, K")
     report.add_argument("--video", metavar="VIDEO", help="the clip they were found in")

@@ -41,9 +41,13 @@ class LowRankParams:
 def solve_complete(
     item: Tracks, rank: int, generator: torch.Generator, params: LowRankParams | None = None
 ) -> Reconstruction:
-    """Solve one sequence in which every point is seen in every frame; noise is not modelled."""
+    """Solve one sequence in which every point is seen in every frame; noise is not modelled.
+
+    Computed in float64 (eps_fine is below what float32 can factorise), returned in the type of the tracks.
+    """
     params = params or LowRankParams()
-    data = observe(item)
+    dtype = item.xy.dtype
+    data = observe(item.to(dtype=torch.float64))
     if not bool(data.visible.all()):
         raise ReconError("visible: this solver needs every point in every frame; use solver 'auto'")
     translation = data.xy.mean(1)
@@ -76,7 +80,7 @@ def solve_complete(
     if status is None:
         status = Status("ok", f"best of {len(tried)} starts, view turning by {turn:.0f} degrees")
     scale = torch.ones_like(translation[:, 0])
-    return data.reconstruction(points3d, rotations, scale, translation, rank=rank, status=status)
+    return data.reconstruction(points3d, rotations, scale, translation, rank=rank, status=status).to(dtype=dtype)
 
 
 def logdet(

@@ -139,7 +139,7 @@ def solve_marginal(
             if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
                 break
             eps, level, before = eps * fall, level + 1, modes
-        answer = evaluate(views, views.whitener(eps)[None], model, eps)
+        answer = evaluate(views, views.whitener(eps)[None], model, eps, with_spread=True)
         status = _status(data, rank, model.rotations[0], converged, len(rotations))
         return _reconstruction(data, model, answer, eps, rank, status).to(dtype=dtype)
 
@@ -152,6 +152,7 @@ def _reconstruction(
     What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in pixels of
     the tracks in every frame.
     """
+    assert answer.spread is not None
     points3d, rotations = answer.points[0], model.rotations[0]
     # Weights and translation leave the spread, the residual an isotropic rest that the image measures in two axes.
     residual = points3d.new_tensor([0.0, 0.0, eps**2]).diag()

@@ -93,8 +93,7 @@ def descend(
         model; the value per item (b,); whether every item converged before the steps were spent.
     """
     frames = model.scale.shape[-1]
-    noise = views.noise.diagonal(dim1=-2, dim2=-1).mean() + eps**2
-    residual = noise.expand(len(model.scale))
+    residual = (views.noise.diagonal(dim1=-2, dim2=-1).mean((-1, -2, -3)) + eps**2).expand(len(model.scale))
     now = evaluate(views, whitener, model, eps)
     pairs: list[tuple[Direction, Direction, Tensor]] = []
     done = torch.zeros_like(now.value, dtype=torch.bool)

@@ -79,7 +79,7 @@ class Evaluation:
         pose_fisher: (*b, frames, 4, 4) expected information of the poses.
         points: (*b, frames, points, 3) posterior mean in camera axes, the scale included, translation removed.
         spread: (*b, frames, points, 3, columns) ``points`` moves by ``spread @ d`` with d ~ N(0, I): uncertainty of the
-            weights; the residual comes on top.
+            weights; the residual comes on top. None unless asked for.
         translation: (*b, frames, 2).
     """
 
@@ -89,7 +89,7 @@ class Evaluation:
     loadings: Float[Tensor, "*b points 3 modes"]
     pose_fisher: Float[Tensor, "*b frames 4 4"]
     points: Float[Tensor, "*b frames points 3"]
-    spread: Float[Tensor, "*b frames points 3 columns"]
+    spread: Float[Tensor, "*b frames points 3 columns"] | None
     translation: Float[Tensor, "*b frames 2"]
 
 
@@ -120,7 +120,17 @@ def _placed(model: ShapeModel) -> Tensor:
     return (poses @ flat).unflatten(-2, (model.scale.shape[-1], 3)).unflatten(-1, (basis.shape[-3], basis.shape[-1]))
 
 
-def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float) -> Evaluation:
+def _spread(placed: Tensor, factor: Tensor, gain: Tensor) -> Tensor:
+    """Root of the posterior covariance of the points through that of the weights, columns last."""
+    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    root = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False).mT
+    loadings = placed[..., 1:].transpose(-3, -2)  # (*b, frames, points, 3, modes)
+    # What is measured exactly does not move with the weights.
+    kept = torch.cat([loadings[..., :2, :] - gain @ loadings[..., :2, :], loadings[..., 2:, :]], -2)
+    return (kept.flatten(-3, -2) @ root[..., : kept.shape[-1], :]).unflatten(-2, kept.shape[-3:-1])
+
+
+def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float, *, with_spread: bool = False) -> Evaluation:
     """Minus the log-likelihood with its gradient, see the module's text; ``whitener`` is that of ``views`` at eps."""
     modes = model.loadings.shape[-1]
     placed = _placed(model)
@@ -162,13 +172,7 @@ def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float) -> E
     loose = error - (fitted[..., :2] - plane[..., 0]) - translation[..., None, :]
     inplane = fitted[..., :2] + (gain @ torch.where(seen, loose, loose.new_zeros(()))[..., None])[..., 0]
     points = torch.cat([inplane, fitted[..., 2:]], -1)
-    keep = torch.eye(2, dtype=mean.dtype, device=mean.device) - gain
-    # G^-1 = U U^T with U the inverse transpose of the Cholesky factor.
-    eye = torch.eye(modes + 2, dtype=mean.dtype, device=mean.device)
-    root = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False).mT[..., :modes, :]
-    loading3 = placed[..., 1:].transpose(-3, -2)  # (*b, frames, points, 3, modes)
-    kept = torch.cat([keep @ loading3[..., :2, :], loading3[..., 2:, :]], -2)
-    spread = (kept.flatten(-3, -2) @ root).unflatten(-2, kept.shape[-3:-1])
+    spread = _spread(placed, factor, gain) if with_spread else None
     jacobian = torch.cat([-skew(points)[..., :2, :], points[..., :2, None]], -1)
     seen_jacobian = (whitener @ jacobian).flatten(-3, -2)
     explained = torch.linalg.solve_triangular(factor, design.mT @ seen_jacobian, upper=False)
@@ -182,7 +186,8 @@ def grow_loadings(views: Views, whitener: Tensor, model: ShapeModel, eps: float,
     Directions whose variance exceeds that of the residual become modes, at most ``most``: the number of modes finds
     itself. Loadings of fewer modes are padded with zeros to the largest of the batch.
     """
-    now = evaluate(views, whitener, model, eps)
+    now = evaluate(views, whitener, model, eps, with_spread=True)
+    assert now.spread is not None
     back = model.rotations / model.scale[..., None, None]
     shapes = now.points @ back
     mean = shapes.mean(-3)
