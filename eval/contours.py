@@ -10,6 +10,7 @@ import torch
 
 from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.contour import mask_outline, repair_silhouettes
+from torchrecon.data.synthetic import SyntheticClip, sample_body, sample_motion, static_camera, turning_camera
 
 DROPPED, HOLES, LEAKS = 0.2, 0.15, 0.15  # shares of the frames
 RADIUS = (0.08, 0.20)  # of the discs cut out or added, share of the body's height
@@ -67,8 +68,15 @@ def overlap(a: Bool[Tensor, "*b height width"], b: Bool[Tensor, "*b height width
     return torch.where(union > 0, (a & b).sum((-2, -1)) / union.clamp_min(1), 1.0)
 
 
-def run_repair(truth: Bool[Tensor, "frames height width"], seed: int) -> dict[str, Any]:
-    """Figures of one clip: contour error and overlap before and after, by kind of damage."""
+def run_repair(action: str, view: str, seed: int, out: Path) -> dict[str, Any]:
+    """Figures of one clip of 60 frames, 384 x 288 at 25 per second: contour error and overlap before and after."""
+    generator = torch.Generator().manual_seed(seed)
+    body = sample_body(generator)
+    motion = sample_motion(action, body, frames=60, fps=25.0, generator=generator)
+    make = turning_camera if view == "turning" else static_camera
+    clip = SyntheticClip(body, motion, make(motion, size=(288, 384), generator=generator), seed=seed)
+    rendered = [clip.render(index) for index in range(len(clip))]
+    truth = torch.stack([frame.mask for frame in rendered])
     bad, kinds = corrupt(truth, torch.Generator().manual_seed(seed))
     before, after = hold_last(bad), repair_silhouettes(bad).masks
     errors = {"corrupted": contour_error(before, truth), "repaired": contour_error(after, truth)}
@@ -78,6 +86,9 @@ def run_repair(truth: Bool[Tensor, "frames height width"], seed: int) -> dict[st
         if (kinds == kind).any():
             figures[f"{name}_px"] = [float(error[kinds == kind].mean()) for error in errors.values()]
     figures["iou"] = [float(overlap(masks, truth).mean()) for masks in (before, after)]
+    worst = int(errors["corrupted"].argmax())
+    curves = [mask_outline(masks[worst], SAMPLES) for masks in (after, before)]
+    draw_outlines(rendered[worst].rgb, curves, out / f"repair_{action}_{view}.png")
     return figures
 
 

@@ -6,6 +6,7 @@ from torchrecon.contour.mover import MoverParams, find_mover
 from torchrecon.contour.outline import NormalisedOutline, align_start, fill_outline, mask_outline, normalise_outline
 from torchrecon.contour.part_model import Detections, PartMatch, PartModel, PartTemplates, motion_labels
 from torchrecon.contour.repair import RepairedSilhouettes, RepairParams, repair_silhouettes
+from torchrecon.contour.silhouette import SilhouetteParams, follow_silhouette, silhouette_from_box
 
 __all__ = [
     "Detections",
@@ -17,13 +18,16 @@ __all__ = [
     "PartTemplates",
     "RepairParams",
     "RepairedSilhouettes",
+    "SilhouetteParams",
     "align_start",
     "background_paths",
     "fill_outline",
     "find_mover",
+    "follow_silhouette",
     "mask_outline",
     "motion_labels",
     "normalise_outline",
     "own_motion",
     "repair_silhouettes",
+    "silhouette_from_box",
 ]
