@@ -14,12 +14,15 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.contour.global_motion import background_homography
 from torchrecon.errors import ReconError
 
 __all__ = ["SilhouetteParams", "follow_silhouette", "silhouette_from_box"]
+
+_BINS = 16  # colour bins per channel
 
 Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8]
@@ -106,6 +109,24 @@ def _carry(mask: Mask, now: Image, before: Image) -> Mask:
     carried = cv2.remap(mask.astype(np.float32), x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
     result: Mask = carried > 0.5
     return result
+
+
+def _bin(image: Image) -> NDArray[np.int64]:
+    """Index of each pixel's colour in a histogram."""
+    part = image.astype(np.int64) * _BINS // 256
+    return (part[..., 0] * _BINS + part[..., 1]) * _BINS + part[..., 2]
+
+
+def _palette(image: Image, mask: Mask) -> NDArray[np.float64]:
+    """Log odds of each colour bin, body against all else, in the frame whose mask is given."""
+    codes = _bin(image)
+    share = []
+    for region in (mask, ~mask):
+        counts = np.bincount(codes[region], minlength=_BINS**3).reshape((_BINS,) * 3)
+        smooth = ndimage.gaussian_filter(counts / max(1, region.sum()), 0.7, mode="constant").ravel()
+        share.append(smooth + 1.0 / _BINS**3)
+    odds: NDArray[np.float64] = np.log(share[0] / share[1])
+    return odds
 
 
 def _cut(image: Image, labels: NDArray[np.uint8], iterations: int) -> Mask:
@@ -212,9 +233,12 @@ def _pass(frames: Frames, first: Mask, background: _Background | None, params: S
     import cv2
 
     mask, before = first, None
+    palette = np.zeros(_BINS**3)
     for frame in frames:
         image = _to_image(frame)
         gray = _gray(image)
+        if before is None:
+            palette = _palette(image, first)
         if before is None or not mask.any():
             before = gray
             yield mask
@@ -235,8 +259,11 @@ def _pass(frames: Frames, first: Mask, background: _Background | None, params: S
         labels[core] = cv2.GC_FGD
         if background is not None:
             away = background.difference(image)
-            labels[near & (away > params.changed)] = cv2.GC_PR_FGD
-            labels[guess & (away > params.changed)] = cv2.GC_FGD
+            # what is neither background nor of the body's colours is something that it holds or passes
+            changed, likely = away > params.changed, palette[_bin(image)] > 0
+            labels[near & ~guess & changed & likely] = cv2.GC_PR_FGD
+            labels[guess & changed & likely] = cv2.GC_FGD
+            labels[guess & ~core & changed & ~likely] = cv2.GC_PR_BGD
             same = away < params.same
             labels[near & ~guess & same] = cv2.GC_BGD
             # what was the body and looks like the background may be either
