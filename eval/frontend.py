@@ -1,8 +1,9 @@
-"""How good the tracks are: real clips against sensor depth or by count, synthetic clips against the truth.
+"""How good tracks, silhouettes and contours are, on real clips and against the truth of synthetic ones.
 
-    python -m eval.frontend [--clip NAME ...] [--synthetic] [-o DIR]
+    python -m eval.frontend [--clip NAME ...] [--synthetic] [--only tracks|silhouette|contour|depth] [-o DIR]
 
-Without ``--clip`` and ``--synthetic`` everything is run. Figures go to ``frontend.json`` (unrounded) and to the screen,
+Without ``--clip``, ``--synthetic`` and ``--only`` everything is run: tracks, silhouettes, the repair of silhouettes by
+the kernel dynamical model, and depth (Fig. 3). Figures go to ``frontend.json`` (unrounded) and to the screen,
 pictures of the tracks on frames beside them. Constants of the counts: a track is moving if it departs by 3 px or more
 from the fitted motion of the background within the window; counted tracks keep 4 px from each other.
 """
@@ -13,11 +14,14 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from eval.contours import run_repair
+from eval.silhouettes import run_clip_silhouette, run_depth_figure, run_depth_silhouette, run_synthetic_silhouette
 from torchrecon._typing import Float, Tensor
 from torchrecon.contour.global_motion import background_paths, own_motion
 from torchrecon.contour.mover import find_mover
@@ -212,15 +216,54 @@ def run_synthetic(action: str, view: str, seed: int, out: Path) -> dict[str, Any
     }
 
 
+def silhouettes(seed: int, out: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Silhouettes followed from a first-frame mask, and one found by depth."""
+    for action in ACTIONS:
+        yield f"silhouette {action} static", run_synthetic_silhouette(action, seed, out)
+    if (VIDEO / "davis_dance_twirl").is_dir():
+        yield "silhouette davis_dance_twirl", run_clip_silhouette(VIDEO / "davis_dance_twirl", out)
+    if (VIDEO / "kinect_turn").is_dir():
+        yield "silhouette kinect_turn by depth", run_depth_silhouette(VIDEO / "kinect_turn", out)
+
+
+def contours(seed: int, out: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Corrupted silhouettes of the synthetic world repaired; the last line is the mean over the clips."""
+    errors = []
+    for view in ("turning", "static"):
+        for action in ACTIONS:
+            figures = run_repair(action, view, seed, out)
+            errors.append((figures["corrupted_px"], figures["repaired_px"]))
+            yield f"repair {action} {view}", figures
+    before, after = (sum(column) / len(errors) for column in zip(*errors, strict=True))
+    yield "repair mean", {"corrupted_px": before, "repaired_px": after, "lowered_by": 1 - after / before}
+
+
+def depths(seed: int, out: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Fig. 3."""
+    yield "depth squat", run_depth_figure(seed, out)
+
+
+PARTS: dict[str, Callable[[int, Path], Iterator[tuple[str, dict[str, Any]]]]] = {
+    "silhouette": silhouettes,
+    "contour": contours,
+    "depth": depths,
+}
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m eval.frontend", description="Figures and pictures of the tracker.")
     parser.add_argument("--clip", nargs="+", default=None, help="names in the video folder")
     parser.add_argument("--synthetic", action="store_true", help="the synthetic clips")
+    parser.add_argument("--only", choices=["tracks", *PARTS], default=None, help="one part of the front end")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--out", type=Path, default=Path("out/frontend"))
     chosen = parser.parse_args(argv)
     clips = chosen.clip
-    everything = clips is None and not chosen.synthetic
+    tracks_named = clips is not None or chosen.synthetic
+    if tracks_named and chosen.only not in (None, "tracks"):
+        parser.error("--clip and --synthetic choose among the tracks; they do not go with --only " + chosen.only)
+    everything = not tracks_named and chosen.only in (None, "tracks")
+    parts = [chosen.only] if chosen.only in PARTS else [] if tracks_named or chosen.only else list(PARTS)
     if everything:
         clips = ["kinect_turn", "PS7A1P1T1.avi", "bb_senatopal.mp4"] if VIDEO.is_dir() else []
     chosen.out.mkdir(parents=True, exist_ok=True)
@@ -235,6 +278,10 @@ def main(argv: list[str] | None = None) -> int:
                     key = f"synthetic {action} {view}"
                     results[key] = run_synthetic(action, view, chosen.seed, chosen.out)
                     print(_line(key, results[key]), flush=True)
+        for part in parts:
+            for key, figures in PARTS[part](chosen.seed, chosen.out):
+                results[key] = figures
+                print(_line(key, figures), flush=True)
     except ReconError as error:
         print(f"eval.frontend: {error}", file=sys.stderr)
         return 2

@@ -71,5 +71,5 @@ def test_every_equation_names_a_test_that_exists():
         names = re.findall(r"`(test_\w+)`", tests)
         assert names or tests.strip() == "open", number
         assert set(names) <= have, (number, set(names) - have)
-        built = int(number) <= 5 or 12 <= int(number) <= 31
+        built = int(number) <= 31
         assert names or not built, f"equation {number} is built and has no test"

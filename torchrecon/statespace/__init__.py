@@ -1,4 +1,4 @@
-"""Motion models of one coordinate over time: alpha-beta-gamma (causal) and constant-acceleration smoothing."""
+"""Motion models over time: alpha-beta-gamma (causal), constant-acceleration smoothing, and a given linear model."""
 
 from torchrecon.statespace.abg import (
     abg_alpha,
@@ -9,10 +9,13 @@ from torchrecon.statespace.abg import (
     abg_tracking_index,
     abg_update,
 )
+from torchrecon.statespace.linear_gaussian import LinearModel, SmoothedStates, smooth_states
 from torchrecon.statespace.rts import Smoothed, best_tracking_index, rts_smooth
 
 __all__ = [
+    "LinearModel",
     "Smoothed",
+    "SmoothedStates",
     "abg_alpha",
     "abg_covariance",
     "abg_gains",
@@ -22,4 +25,5 @@ __all__ = [
     "abg_update",
     "best_tracking_index",
     "rts_smooth",
+    "smooth_states",
 ]
