@@ -18,6 +18,7 @@ from torchrecon.linalg.missing_factors import fit_factors, grow_factors, start_f
 from torchrecon.linalg.noise_edge import marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, grow_loadings, tangents
@@ -39,7 +40,8 @@ class MarginalParams:
         finest: how far below ``fine`` the residual goes on falling while no new mode appears.
         levels: number of residual levels, geometric from coarse to fine (count).
         trial_levels: levels after which the likeliest start is kept (count).
-        starts: starts that are tried, lowest residual of the upgrade first (count).
+        starts: starts from the metric upgrade, lowest residual first (count).
+        gram_bases: numbers of bases for which the upgrade of least trace supplies one more start (count).
         steps: quasi-Newton steps per level (count); last_steps: on the last level.
         growths: steps of expectation-maximisation before each level (count).
         modes: deformation modes at most (count).
@@ -54,7 +56,8 @@ class MarginalParams:
     finest: float = 0.0001
     levels: int = 8
     trial_levels: int = 2
-    starts: int = 3
+    starts: int = 2
+    gram_bases: tuple[int, ...] = (2, 3)
     steps: int = 15
     last_steps: int = 100
     growths: int = 2
@@ -121,7 +124,9 @@ def solve_marginal(
         centred = filled - filled.mean(1, keepdim=True)
         stack = centred.mT.flatten(0, 1)
         found = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
-        rotations = torch.stack([start[2] for start in found[: params.starts]])
+        starts = [start[2] for start in found[: params.starts]]
+        starts += [gram_upgrade(stack, 3 * bases, scaled=False).rotations for bases in params.gram_bases]
+        rotations = torch.stack(starts)
         model = _rigid_model(filled, rotations)
         views = _views(data, stack, params.noise_share)
         fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
