@@ -45,7 +45,7 @@ def test_exact_on_clean_rigid_data(name):
     torch.testing.assert_close(rec.points3d.mean(-2), torch.zeros(40, 3), atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["auto"])
+@pytest.mark.parametrize("name", ["auto", "pnd2"])
 def test_exact_on_clean_rank_3k_data(name):
     truth = _world(rank=2, frames=60, points=24)
     rec = get_solver(name)(Tracks(truth[..., :2]), 2)
@@ -54,7 +54,7 @@ def test_exact_on_clean_rank_3k_data(name):
     assert rec.basis.shape == (2, 24, 3)
 
 
-@pytest.mark.parametrize("name", ["auto", "rigid"])
+@pytest.mark.parametrize("name", ["auto", "pnd2", "rigid"])
 def test_error_grows_in_step_with_the_noise(name):
     truth = _world()
     noise = torch.randn(truth[..., :2].shape, generator=torch.Generator().manual_seed(1))
@@ -67,7 +67,7 @@ def test_error_grows_in_step_with_the_noise(name):
     assert 0.7 < slope < 1.3, errors.tolist()
 
 
-@pytest.mark.parametrize("name", ["logdet", "rigid", "trajectory"])
+@pytest.mark.parametrize("name", ["logdet", "pnd2", "rigid", "trajectory"])
 def test_follows_point_order_and_translation(name):
     truth = _world()
     solve = get_solver(name)
@@ -80,7 +80,7 @@ def test_follows_point_order_and_translation(name):
     torch.testing.assert_close(moved.points3d, straight.points3d, atol=float(2e-3 * size), rtol=0)
 
 
-@pytest.mark.parametrize("name", ["logdet", "rigid"])
+@pytest.mark.parametrize("name", ["logdet", "pnd2", "rigid"])
 def test_follows_image_rotation(name):
     truth = _world()
     turn = rotation_from_vector(torch.tensor([0.0, 0.0, 0.7]))

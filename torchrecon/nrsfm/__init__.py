@@ -8,12 +8,13 @@ from torchrecon.errors import ReconError
 from torchrecon.measurement import Solver
 from torchrecon.nrsfm.auto import auto
 from torchrecon.nrsfm.lowrank import logdet
+from torchrecon.nrsfm.pnd2 import pnd2
 from torchrecon.nrsfm.rigid import rigid
 from torchrecon.nrsfm.trajectory import trajectory
 
-__all__ = ["SOLVERS", "auto", "get_solver", "logdet", "rigid", "trajectory"]
+__all__ = ["SOLVERS", "auto", "get_solver", "logdet", "pnd2", "rigid", "trajectory"]
 
-SOLVERS: dict[str, Solver] = {"auto": auto, "logdet": logdet, "rigid": rigid, "trajectory": trajectory}
+SOLVERS: dict[str, Solver] = {"auto": auto, "logdet": logdet, "pnd2": pnd2, "rigid": rigid, "trajectory": trajectory}
 
 
 def get_solver(name: str) -> Solver:

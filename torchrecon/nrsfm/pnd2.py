@@ -1,0 +1,318 @@
+"""Procrustean normal distribution (Lee, Cho, Choi and Oh 2013; Lee, Cho and Oh 2016), fitted by an annealed EM.
+
+Model: the shape of a frame, turned and scaled onto the mean shape by Procrustes, is Gaussian, and what Procrustes
+takes away (rotation, scale, translation) is no deformation: the covariance is orthogonal to the seven tangents of the
+similarities at the mean. Depths and unseen entries are latent and integrated out; no number of bases is given.
+
+Recalled from the papers: this distribution, EM with the depths latent, no K. Derived here: the covariance
+``L L^T + eps^2 I`` whose L takes the directions that exceed ``eps^2`` (so every frame costs r x r algebra), views and
+sizes by Fisher scoring on the marginal likelihood in place of a re-alignment of the expected shapes (which stops
+far from the optimum), and the annealing of eps. It is not the authors' code and has no motion prior from frame to
+frame. Not used: measured depth, the covariance of observations. Cost: linear in frames, cubic in points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from torchrecon._typing import Bool, Float, Int, Tensor
+from torchrecon.linalg import rotation_from_vector
+from torchrecon.linalg.missing_factors import fit_factors, grow_factors, start_factors
+from torchrecon.measurement import Reconstruction, Status, Tracks
+from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.observations import Observations, observe
+from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
+
+__all__ = ["Pnd2Params", "ProcrusteanNormal", "fit_procrustean", "pnd2", "similarity_tangents"]
+
+STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
+LONGEST_TURN = 0.3  # radians that one scoring step may turn a view: beyond it the linearisation says nothing
+
+
+@dataclass(frozen=True)
+class Pnd2Params:
+    """Parameters of the fit; lengths are in units of the rms size of the tracks.
+
+    Attributes:
+        eps_coarse: first standard deviation outside the deformation subspace (rms size).
+        eps_fine: last standard deviation outside the deformation subspace (rms size).
+        short_iterations: EM steps spent on every start, eps falling all the way (count).
+        long_iterations: EM steps at ``eps_fine`` spent on the best start (count).
+        keep: starts that are tried, those of the lowest residual of each K first (count).
+        largest_rank: most deformation directions (count).
+        tolerance: gain of log-likelihood per step and frame at which the fit has converged (nats).
+        upgrade: of the metric upgrade, which supplies the starts.
+    """
+
+    eps_coarse: float = 0.1
+    eps_fine: float = 3e-3
+    short_iterations: int = 80
+    long_iterations: int = 300
+    keep: int = 2
+    largest_rank: int = 60
+    tolerance: float = 1e-3
+    upgrade: UpgradeParams = field(default_factory=UpgradeParams)
+
+
+@dataclass(frozen=True, eq=False)
+class ProcrusteanNormal:
+    """Views, sizes and the distribution of the aligned shapes.
+
+    Attributes:
+        rotations: canonical -> camera.
+        scale: size of each frame's shape relative to the mean shape, geometric mean 1.
+        translation: image position of the centroid.
+        mean: shape about its centroid.
+        loadings: standard deviations times directions of the deformations.
+    """
+
+    rotations: Float[Tensor, "frames 3 3"]
+    scale: Float[Tensor, " frames"]
+    translation: Float[Tensor, "frames 2"]
+    mean: Float[Tensor, "points 3"]
+    loadings: Float[Tensor, "points 3 rank"]
+
+
+def similarity_tangents(mean: Float[Tensor, "points 3"]) -> Float[Tensor, "coordinates 7"]:
+    """Orthonormal directions in which a shape changes when it is moved, turned or scaled (rows: x, y, z per point).
+
+    Example:
+        >>> import torch
+        >>> basis = similarity_tangents(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)))
+        >>> basis.shape, bool((basis.T @ basis - torch.eye(7)).abs().max() < 1e-5)
+        (torch.Size([18, 7]), True)
+    """
+    axes = torch.eye(3, dtype=mean.dtype, device=mean.device)[:, None].expand(3, *mean.shape)
+    turned = torch.linalg.cross(axes, mean.expand_as(axes))
+    basis: Tensor = torch.linalg.qr(torch.cat([axes, turned, mean[None]]).flatten(1).mT)[0]
+    return basis
+
+
+def _covariance_of_depths(lifted: Tensor, view: Tensor, eps2: float) -> Tensor:
+    """Mean over frames of the posterior covariance of canonical shapes when every point is seen: depth alone varies."""
+    frames, points, _ = lifted.shape
+    blocks = lifted @ lifted.mT
+    blocks.diagonal(dim1=1, dim2=2).add_(eps2)
+    along = (view[:, :, None] * view[:, None, :]).flatten(1) / frames
+    mean = (along.mT @ blocks.flatten(1)).view(3, 3, points, points)
+    return mean.permute(2, 0, 3, 1).reshape(3 * points, 3 * points)
+
+
+def _covariance(lifted: Tensor, rotations: Tensor, missing: Tensor, eps2: float) -> Tensor:
+    """The same where entries are missing, which vary in all three coordinates; ``lifted`` (F, 3, P, r), camera axes."""
+    frames, _, points, rank = lifted.shape
+    turned = (rotations.mT @ lifted.flatten(2)).view(frames, 3, points, rank)
+    flat = turned.permute(2, 1, 0, 3).reshape(3 * points, frames * rank)
+    total = (flat @ flat.mT / frames).view(points, 3, points, 3)
+    free = torch.cat([missing[:, None].expand(-1, 2, -1), torch.ones_like(missing)[:, None]], 1)
+    noise = torch.einsum("fia,fip,fib->pab", rotations, free, rotations) * (eps2 / frames)
+    index = torch.arange(points, device=lifted.device)
+    total[index, :, index, :] += noise
+    return total.reshape(3 * points, 3 * points)
+
+
+def _step(
+    xy: Tensor, seen: Tensor, model: ProcrusteanNormal, eps2: float, largest: int
+) -> tuple[ProcrusteanNormal, Tensor, float]:
+    """One EM step with one scoring step of the views.
+
+    Both start from the same posterior: taking them in turn halves the pace along the valley in which a tilt of the
+    views trades with depth.
+
+    Returns:
+        new model; expected camera-frame shapes (F, P, 3) and mean minus twice log-likelihood of the old one.
+    """
+    frames, points = seen.shape
+    rotations, scale, mean = model.rotations, model.scale, model.mean
+    rank = model.loadings.shape[-1]
+    width = scale[:, None, None]
+    noise = eps2 * scale.square()
+    moved = (rotations.reshape(-1, 3) @ model.loadings.permute(1, 0, 2).flatten(1)).view(frames, 3, points, rank)
+    moved = moved * width[..., None]
+    centre = mean @ rotations.mT * width
+    loads = (moved[:, :2] * seen[:, None, :, None]).flatten(1, 2)
+    rest = ((xy - centre[..., :2] - model.translation[:, None]) * seen[..., None]).mT.flatten(1)
+    # posterior of the deformation weights: r x r per frame
+    inner = loads.mT @ loads / noise[:, None, None]
+    inner.diagonal(dim1=1, dim2=2).add_(1)
+    factor = torch.linalg.cholesky(inner)
+    weights = torch.cholesky_solve((loads.mT @ rest[..., None]) / noise[:, None, None], factor)
+    unexplained = rest - (loads @ weights)[..., 0]
+    dual = unexplained / noise[:, None]
+    count = 2 * seen.sum(1)
+    cost = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1) + count * noise.log() + (rest * dual).sum(1)
+    shape = centre + (moved.flatten(1, 2) @ weights)[..., 0].view(frames, 3, points).mT
+    expected = shape.clone()
+    expected[..., :2] += unexplained.view(frames, 2, points).mT
+
+    # half the gradient and the Fisher information in (rotation vector, log size, translation)
+    x, y, z = shape.unbind(-1)
+    zero, one = torch.zeros_like(seen), seen
+    columns = [(zero, -z), (z, zero), (-y, x), (x, y), (one, zero), (zero, one)]
+    jacobian = torch.stack([torch.cat(pair, 1) for pair in columns], 2) * torch.cat([seen, seen], 1)[..., None]
+    half_inverse = torch.linalg.solve_triangular(
+        factor, torch.eye(rank, dtype=xy.dtype, device=xy.device).expand_as(factor), upper=False
+    )
+    lifted = moved @ half_inverse.mT[:, None]
+    along = (loads @ half_inverse.mT).unflatten(1, (2, points))
+    trade = (along * (lifted[:, 2] * seen[..., None])[:, None]).sum((2, 3)) / noise[:, None]
+    gradient = -(jacobian.mT @ dual[..., None])[..., 0]
+    gradient[:, 0] -= trade[:, 1]
+    gradient[:, 1] += trade[:, 0]
+    gradient[:, 3] += count - dual.square().sum(1) * noise
+    explained = half_inverse @ (loads.mT @ jacobian)
+    information = jacobian.mT @ jacobian - explained.mT @ explained / noise[:, None, None]
+    information = information / noise[:, None, None]
+    ridge = 1e-6 * information.diagonal(dim1=1, dim2=2)[:, :4].mean(1)
+    information.diagonal(dim1=1, dim2=2).add_(ridge[:, None])
+    change = -torch.linalg.solve(information, gradient[..., None])[..., 0]
+    change = change * (LONGEST_TURN / change[:, :3].norm(dim=1, keepdim=True).clamp_min(LONGEST_TURN))
+
+    # moments of the canonical shapes about the old mean
+    offset = ((expected - centre) @ rotations / width).flatten(1)
+    shift = offset.mean(0)
+    moment = offset.mT @ offset / frames - torch.outer(shift, shift)
+    lifted = lifted / width[..., None]
+    if bool(seen.all()):
+        moment = moment + _covariance_of_depths(lifted[:, 2], rotations[:, 2], eps2)
+    else:
+        missing = 1 - seen
+        free = torch.stack([missing, missing, torch.ones_like(missing)], 1)[..., None]
+        moment = moment + _covariance(lifted * free, rotations, missing, eps2)
+    size = scale * change[:, 3].clamp(-0.1, 0.1).exp()
+    unit = size.log().mean().exp()
+    mean = (mean + shift.view(points, 3)) * unit
+    mean = mean - mean.mean(0)
+    tangents = similarity_tangents(mean)
+    moment = moment - tangents @ (tangents.mT @ moment)
+    moment = (moment - (moment @ tangents) @ tangents.mT) * unit**2
+    values, vectors = torch.linalg.eigh(moment)
+    kept = min(max(1, int((values > eps2).sum())), largest, 3 * points)
+    spread = (values[-kept:] - eps2).clamp_min(1e-12).sqrt()
+    new = ProcrusteanNormal(
+        rotation_from_vector(change[:, :3]) @ rotations,
+        size / unit,
+        model.translation + change[:, 4:],
+        mean,
+        (vectors[:, -kept:] * spread).view(points, 3, kept),
+    )
+    return new, expected, float(cost.mean())
+
+
+def fit_procrustean(
+    xy: Float[Tensor, "frames points 2"],
+    visible: Bool[Tensor, "frames points"],
+    model: ProcrusteanNormal,
+    iterations: int,
+    params: Pnd2Params,
+    *,
+    anneal: bool,
+) -> tuple[ProcrusteanNormal, Float[Tensor, "frames points 3"], float, bool]:
+    """EM from a given model.
+
+    Args:
+        xy: in units of the rms size; entries that are not visible have to be finite, their value does not matter.
+        anneal: let eps fall over the first 90 % of the iterations; else it stays at its fine value.
+
+    Returns:
+        the model, the expected shapes in camera axes, minus twice the log-likelihood per frame at ``eps_fine`` (it
+        ranks answers for the same tracks) and whether it had converged before the limit.
+    """
+    seen = visible.to(xy.dtype)
+    falling = 0.9 * iterations if anneal else 0.0
+    ratio = params.eps_fine / params.eps_coarse
+    previous, converged = float("inf"), False
+    for index in range(iterations):
+        eps = params.eps_coarse * ratio ** (index / falling) if index < falling else params.eps_fine
+        model, _, cost = _step(xy, seen, model, eps**2, params.largest_rank)
+        if index >= falling and index % 10 == 9:
+            if abs(previous - cost) < 10 * params.tolerance:
+                converged = True
+                break
+            previous = cost
+    _, expected, cost = _step(xy, seen, model, params.eps_fine**2, params.largest_rank)
+    return model, expected, cost, converged
+
+
+def _filled(data: Observations) -> Tensor:
+    """Every entry with a value, for the starts alone: a low-rank fit to what was seen."""
+    if bool(data.visible.all()):
+        return data.xy
+    model = start_factors(data.xy, data.visible)
+    for _ in range(2):
+        model = fit_factors(grow_factors(model, data.xy, data.visible, 3), data.xy, data.visible)
+    return torch.where(data.visible[..., None], data.xy, model.predict())
+
+
+def _rigid_start(xy: Tensor, rotations: Tensor) -> ProcrusteanNormal:
+    """The rigid shape that fits the views best, with no deformation yet."""
+    frames, points, _ = xy.shape
+    shift = xy.mean(1)
+    rows = rotations[:, :2].flatten(0, 1)
+    shape = (torch.linalg.pinv(rows.mT @ rows) @ (rows.mT @ (xy - shift[:, None]).mT.flatten(0, 1))).mT
+    return ProcrusteanNormal(rotations, xy.new_ones(frames), shift, shape, xy.new_zeros(points, 3, 1))
+
+
+def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2Params | None = None) -> Reconstruction:
+    """Solve one sequence (batch ``()``); works in float64 whatever the tracks are."""
+    params = params or Pnd2Params()
+    data = observe(item)
+    kind = data.xy.dtype
+    data = replace(data, xy=data.xy.double())
+    xy, visible = data.xy, data.visible
+    filled = _filled(data)
+    stack = (filled - filled.mean(1, keepdim=True)).mT.flatten(0, 1)
+    starts = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
+    tried = [
+        fit_procrustean(xy, visible, _rigid_start(filled, views), params.short_iterations, params, anneal=True)
+        for _, _, views in starts[: params.keep]
+    ]
+    best = min(tried, key=lambda answer: answer[2])
+    model, points3d, _, converged = fit_procrustean(xy, visible, best[0], params.long_iterations, params, anneal=False)
+    flip = xy.new_ones(3)
+    flip[2] = mirror_sign(points3d)
+    points3d, rotations = points3d * flip, model.rotations * (flip[:, None] * flip)
+    turn = float(turn_of_view(rotations))
+    status = check_size(item, 1)
+    if status is None and (turn < STATIC_TURN or looks_static(stack.unflatten(0, (-1, 2)).mT)):
+        status = Status(
+            "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
+        )
+    if status is None and not converged:
+        status = Status(
+            "not_converged", f"the likelihood still rose after {params.long_iterations} steps from the best start"
+        )
+    if status is None:
+        deformations = model.loadings.shape[-1]
+        status = Status("ok", f"{deformations} deformation directions, view turning by {turn:.0f} degrees")
+    scale = torch.ones_like(model.scale)
+    if item.intrinsics is not None:  # weak perspective: what the frames differ in is distance, not size
+        scale, points3d = model.scale, points3d / model.scale[:, None, None]
+    return data.reconstruction(
+        points3d.to(kind), rotations.to(kind), scale.to(kind), model.translation.to(kind), rank=rank, status=status
+    )
+
+
+def pnd2(
+    tracks: Tracks, rank: int | Int[Tensor, "*batch"], *, generator: torch.Generator | None = None
+) -> Reconstruction:
+    """Procrustean normal distribution from orthographic or weak-perspective tracks, gaps allowed; any leading batch.
+
+    Args:
+        tracks: seen entries only are read.
+        rank: reported as it is given; the fit finds its own number of deformations.
+        generator: starts of the metric upgrade.
+
+    Example:
+        >>> import torch
+        >>> g = torch.Generator().manual_seed(0)
+        >>> shape = torch.randn(12, 3, generator=g)
+        >>> turn = rotation_from_vector(torch.linspace(0, 2, 15)[:, None] * torch.tensor([0.1, 1.0, 0.0]))
+        >>> truth = shape @ turn.mT
+        >>> rec = pnd2(Tracks(truth[..., :2]), 1)
+        >>> bool((rec.reproject() - truth[..., :2]).abs().max() < 1e-3), rec.status.code
+        (True, 'ok')
+    """
+    return solve_items(tracks, rank, solve_pnd2, generator)
