@@ -68,14 +68,14 @@ class ProcrusteanNormal:
         loadings: standard deviations times directions of the deformations.
     """
 
-    rotations: Float[Tensor, "frames 3 3"]
-    scale: Float[Tensor, " frames"]
-    translation: Float[Tensor, "frames 2"]
-    mean: Float[Tensor, "points 3"]
-    loadings: Float[Tensor, "points 3 rank"]
+    rotations: Float[Tensor, "*batch frames 3 3"]
+    scale: Float[Tensor, "*batch frames"]
+    translation: Float[Tensor, "*batch frames 2"]
+    mean: Float[Tensor, "*batch points 3"]
+    loadings: Float[Tensor, "*batch points 3 rank"]
 
 
-def similarity_tangents(mean: Float[Tensor, "points 3"]) -> Float[Tensor, "coordinates 7"]:
+def similarity_tangents(mean: Float[Tensor, "*batch points 3"]) -> Float[Tensor, "*batch coordinates 7"]:
     """Orthonormal directions in which a shape changes when it is moved, turned or scaled (rows: x, y, z per point).
 
     Example:
@@ -84,38 +84,38 @@ def similarity_tangents(mean: Float[Tensor, "points 3"]) -> Float[Tensor, "coord
         >>> basis.shape, bool((basis.T @ basis - torch.eye(7)).abs().max() < 1e-5)
         (torch.Size([18, 7]), True)
     """
-    axes = torch.eye(3, dtype=mean.dtype, device=mean.device)[:, None].expand(3, *mean.shape)
-    turned = torch.linalg.cross(axes, mean.expand_as(axes))
-    basis: Tensor = torch.linalg.qr(torch.cat([axes, turned, mean[None]]).flatten(1).mT)[0]
+    wide = mean[..., None, :, :].expand(*mean.shape[:-2], 3, *mean.shape[-2:])
+    axes = torch.eye(3, dtype=mean.dtype, device=mean.device)[:, None].expand_as(wide)
+    columns = torch.cat([axes, torch.linalg.cross(axes, wide), mean[..., None, :, :]], -3)
+    basis: Tensor = torch.linalg.qr(columns.flatten(-2).mT)[0]
     return basis
 
 
 def _covariance_of_depths(lifted: Tensor, view: Tensor, eps2: float) -> Tensor:
     """Mean over frames of the posterior covariance of canonical shapes when every point is seen: depth alone varies."""
-    frames, points, _ = lifted.shape
+    points = lifted.shape[-2]
     blocks = lifted @ lifted.mT
-    blocks.diagonal(dim1=1, dim2=2).add_(eps2)
-    along = (view[:, :, None] * view[:, None, :]).flatten(1) / frames
-    mean = (along.mT @ blocks.flatten(1)).view(3, 3, points, points)
-    return mean.permute(2, 0, 3, 1).reshape(3 * points, 3 * points)
+    blocks.diagonal(dim1=-2, dim2=-1).add_(eps2)
+    along = (view[..., :, None] * view[..., None, :]).flatten(-2) / view.shape[-2]
+    mean = (along.mT @ blocks.flatten(-2)).unflatten(-1, (points, points)).unflatten(-3, (3, 3))
+    return mean.movedim((-4, -3), (-3, -1)).flatten(-4, -3).flatten(-2)
 
 
 def _covariance(lifted: Tensor, rotations: Tensor, missing: Tensor, eps2: float) -> Tensor:
     """The same where entries are missing, which vary in all three coordinates; ``lifted`` (F, 3, P, r), camera axes."""
-    frames, _, points, rank = lifted.shape
-    turned = (rotations.mT @ lifted.flatten(2)).view(frames, 3, points, rank)
-    flat = turned.permute(2, 1, 0, 3).reshape(3 * points, frames * rank)
-    total = (flat @ flat.mT / frames).view(points, 3, points, 3)
-    free = torch.cat([missing[:, None].expand(-1, 2, -1), torch.ones_like(missing)[:, None]], 1)
-    noise = torch.einsum("fia,fip,fib->pab", rotations, free, rotations) * (eps2 / frames)
-    index = torch.arange(points, device=lifted.device)
-    total[index, :, index, :] += noise
-    return total.reshape(3 * points, 3 * points)
+    frames, _, points, rank = lifted.shape[-4:]
+    turned = (rotations.mT @ lifted.flatten(-2)).unflatten(-1, (points, rank))
+    flat = turned.movedim((-2, -3), (-4, -3)).flatten(-2).flatten(-3, -2)
+    total = (flat @ flat.mT / frames).unflatten(-2, (points, 3)).unflatten(-1, (points, 3))
+    free = torch.stack([missing, missing, torch.ones_like(missing)], -2)
+    noise = torch.einsum("...fia,...fip,...fib->...abp", rotations, free, rotations) * (eps2 / frames)
+    total.diagonal(dim1=-4, dim2=-2).add_(noise)
+    return total.flatten(-4, -3).flatten(-2)
 
 
 def _step(
     xy: Tensor, seen: Tensor, model: ProcrusteanNormal, eps2: float, largest: int
-) -> tuple[ProcrusteanNormal, Tensor, float]:
+) -> tuple[ProcrusteanNormal, Tensor, Tensor]:
     """One EM step with one scoring step of the views.
 
     Both start from the same posterior: taking them in turn halves the pace along the valley in which a tilt of the
@@ -124,93 +124,95 @@ def _step(
     Returns:
         new model; expected camera-frame shapes (F, P, 3) and mean minus twice log-likelihood of the old one.
     """
-    frames, points = seen.shape
+    frames, points = seen.shape[-2:]
     rotations, scale, mean = model.rotations, model.scale, model.mean
     rank = model.loadings.shape[-1]
-    width = scale[:, None, None]
+    width = scale[..., None, None]
     noise = eps2 * scale.square()
-    moved = (rotations.reshape(-1, 3) @ model.loadings.permute(1, 0, 2).flatten(1)).view(frames, 3, points, rank)
-    moved = moved * width[..., None]
-    centre = mean @ rotations.mT * width
-    loads = (moved[:, :2] * seen[:, None, :, None]).flatten(1, 2)
-    rest = ((xy - centre[..., :2] - model.translation[:, None]) * seen[..., None]).mT.flatten(1)
+    per = noise[..., None, None]
+    placed = model.loadings.movedim(-2, -3).flatten(-2)[..., None, :, :]
+    moved = ((rotations @ placed) * width).unflatten(-1, (points, rank))
+    centre = mean[..., None, :, :] @ rotations.mT * width
+    loads = (moved[..., :2, :, :] * seen[..., None, :, None]).flatten(-3, -2)
+    rest = ((xy - centre[..., :2] - model.translation[..., None, :]) * seen[..., None]).mT.flatten(-2)
     # posterior of the deformation weights: r x r per frame
-    inner = loads.mT @ loads / noise[:, None, None]
-    inner.diagonal(dim1=1, dim2=2).add_(1)
+    inner = loads.mT @ loads / per
+    inner.diagonal(dim1=-2, dim2=-1).add_(1)
     factor = torch.linalg.cholesky(inner)
-    weights = torch.cholesky_solve((loads.mT @ rest[..., None]) / noise[:, None, None], factor)
+    weights = torch.cholesky_solve((loads.mT @ rest[..., None]) / per, factor)
     unexplained = rest - (loads @ weights)[..., 0]
-    dual = unexplained / noise[:, None]
-    count = 2 * seen.sum(1)
-    cost = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1) + count * noise.log() + (rest * dual).sum(1)
-    shape = centre + (moved.flatten(1, 2) @ weights)[..., 0].view(frames, 3, points).mT
+    dual = unexplained / noise[..., None]
+    count = 2 * seen.sum(-1)
+    cost = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + count * noise.log() + (rest * dual).sum(-1)
+    shape = centre + (moved.flatten(-3, -2) @ weights)[..., 0].unflatten(-1, (3, points)).mT
     expected = shape.clone()
-    expected[..., :2] += unexplained.view(frames, 2, points).mT
+    expected[..., :2] += unexplained.unflatten(-1, (2, points)).mT
 
     # half the gradient and the Fisher information in (rotation vector, log size, translation)
     x, y, z = shape.unbind(-1)
     zero, one = torch.zeros_like(seen), seen
     columns = [(zero, -z), (z, zero), (-y, x), (x, y), (one, zero), (zero, one)]
-    jacobian = torch.stack([torch.cat(pair, 1) for pair in columns], 2) * torch.cat([seen, seen], 1)[..., None]
+    both = torch.cat([seen, seen], -1)[..., None]
+    jacobian = torch.stack([torch.cat(pair, -1) for pair in columns], -1) * both
     half_inverse = torch.linalg.solve_triangular(
         factor, torch.eye(rank, dtype=xy.dtype, device=xy.device).expand_as(factor), upper=False
     )
-    lifted = moved @ half_inverse.mT[:, None]
-    along = (loads @ half_inverse.mT).unflatten(1, (2, points))
-    trade = (along * (lifted[:, 2] * seen[..., None])[:, None]).sum((2, 3)) / noise[:, None]
+    lifted = moved @ half_inverse.mT[..., None, :, :]
+    along = (loads @ half_inverse.mT).unflatten(-2, (2, points))
+    depth = (lifted[..., 2, :, :] * seen[..., None])[..., None, :, :]
+    trade = (along * depth).sum((-2, -1)) / noise[..., None]
     gradient = -(jacobian.mT @ dual[..., None])[..., 0]
-    gradient[:, 0] -= trade[:, 1]
-    gradient[:, 1] += trade[:, 0]
-    gradient[:, 3] += count - dual.square().sum(1) * noise
+    gradient[..., 0] -= trade[..., 1]
+    gradient[..., 1] += trade[..., 0]
+    gradient[..., 3] += count - dual.square().sum(-1) * noise
     explained = half_inverse @ (loads.mT @ jacobian)
-    information = jacobian.mT @ jacobian - explained.mT @ explained / noise[:, None, None]
-    information = information / noise[:, None, None]
-    ridge = 1e-6 * information.diagonal(dim1=1, dim2=2)[:, :4].mean(1)
-    information.diagonal(dim1=1, dim2=2).add_(ridge[:, None])
+    information = (jacobian.mT @ jacobian - explained.mT @ explained / per) / per
+    ridge = 1e-6 * information.diagonal(dim1=-2, dim2=-1)[..., :4].mean(-1, keepdim=True)
+    information.diagonal(dim1=-2, dim2=-1).add_(ridge)
     change = -torch.linalg.solve(information, gradient[..., None])[..., 0]
-    change = change * (LONGEST_TURN / change[:, :3].norm(dim=1, keepdim=True).clamp_min(LONGEST_TURN))
+    change = change * (LONGEST_TURN / change[..., :3].norm(dim=-1, keepdim=True).clamp_min(LONGEST_TURN))
 
     # moments of the canonical shapes about the old mean
-    offset = ((expected - centre) @ rotations / width).flatten(1)
-    shift = offset.mean(0)
-    moment = offset.mT @ offset / frames - torch.outer(shift, shift)
+    offset = ((expected - centre) @ rotations / width).flatten(-2)
+    shift = offset.mean(-2)
+    moment = offset.mT @ offset / frames - shift[..., :, None] * shift[..., None, :]
     lifted = lifted / width[..., None]
     if bool(seen.all()):
-        moment = moment + _covariance_of_depths(lifted[:, 2], rotations[:, 2], eps2)
+        moment = moment + _covariance_of_depths(lifted[..., 2, :, :], rotations[..., 2, :], eps2)
     else:
         missing = 1 - seen
-        free = torch.stack([missing, missing, torch.ones_like(missing)], 1)[..., None]
+        free = torch.stack([missing, missing, torch.ones_like(missing)], -2)[..., None]
         moment = moment + _covariance(lifted * free, rotations, missing, eps2)
-    size = scale * change[:, 3].clamp(-0.1, 0.1).exp()
-    unit = size.log().mean().exp()
-    mean = (mean + shift.view(points, 3)) * unit
-    mean = mean - mean.mean(0)
+    size = scale * change[..., 3].clamp(-0.1, 0.1).exp()
+    unit = size.log().mean(-1).exp()[..., None]
+    mean = (mean + shift.unflatten(-1, (points, 3))) * unit[..., None]
+    mean = mean - mean.mean(-2, keepdim=True)
     tangents = similarity_tangents(mean)
     moment = moment - tangents @ (tangents.mT @ moment)
-    moment = (moment - (moment @ tangents) @ tangents.mT) * unit**2
+    moment = (moment - (moment @ tangents) @ tangents.mT) * unit[..., None].square()
     values, vectors = torch.linalg.eigh(moment)
-    kept = min(max(1, int((values > eps2).sum())), largest, 3 * points)
-    spread = (values[-kept:] - eps2).clamp_min(1e-12).sqrt()
+    kept = min(max(1, int((values > eps2).sum(-1).max())), largest, 3 * points)
+    spread = (values[..., -kept:] - eps2).clamp_min(1e-12).sqrt()
     new = ProcrusteanNormal(
-        rotation_from_vector(change[:, :3]) @ rotations,
+        rotation_from_vector(change[..., :3]) @ rotations,
         size / unit,
-        model.translation + change[:, 4:],
+        model.translation + change[..., 4:],
         mean,
-        (vectors[:, -kept:] * spread).view(points, 3, kept),
+        (vectors[..., -kept:] * spread[..., None, :]).unflatten(-2, (points, 3)),
     )
-    return new, expected, float(cost.mean())
+    return new, expected, cost.mean(-1)
 
 
 def fit_procrustean(
-    xy: Float[Tensor, "frames points 2"],
-    visible: Bool[Tensor, "frames points"],
+    xy: Float[Tensor, "*batch frames points 2"],
+    visible: Bool[Tensor, "*batch frames points"],
     model: ProcrusteanNormal,
     iterations: int,
     params: Pnd2Params,
     *,
     anneal: bool,
-) -> tuple[ProcrusteanNormal, Float[Tensor, "frames points 3"], float, bool]:
-    """EM from a given model.
+) -> tuple[ProcrusteanNormal, Float[Tensor, "*batch frames points 3"], Float[Tensor, "*batch"], bool]:
+    """EM from a given model; any leading batch, which shares the number of deformation directions.
 
     Args:
         xy: in units of the rms size; entries that are not visible have to be finite, their value does not matter.
@@ -218,17 +220,17 @@ def fit_procrustean(
 
     Returns:
         the model, the expected shapes in camera axes, minus twice the log-likelihood per frame at ``eps_fine`` (it
-        ranks answers for the same tracks) and whether it had converged before the limit.
+        ranks answers for the same tracks) and whether all had converged before the limit.
     """
     seen = visible.to(xy.dtype)
     falling = 0.9 * iterations if anneal else 0.0
     ratio = params.eps_fine / params.eps_coarse
-    previous, converged = float("inf"), False
+    previous, converged = torch.full(seen.shape[:-2], torch.inf, dtype=xy.dtype, device=xy.device), False
     for index in range(iterations):
         eps = params.eps_coarse * ratio ** (index / falling) if index < falling else params.eps_fine
         model, _, cost = _step(xy, seen, model, eps**2, params.largest_rank)
         if index >= falling and index % 10 == 9:
-            if abs(previous - cost) < 10 * params.tolerance:
+            if bool(((previous - cost).abs() < 10 * params.tolerance).all()):
                 converged = True
                 break
             previous = cost
@@ -269,7 +271,7 @@ def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2
         fit_procrustean(xy, visible, _rigid_start(filled, views), params.short_iterations, params, anneal=True)
         for _, _, views in starts[: params.keep]
     ]
-    best = min(tried, key=lambda answer: answer[2])
+    best = min(tried, key=lambda answer: float(answer[2]))
     model, points3d, _, converged = fit_procrustean(xy, visible, best[0], params.long_iterations, params, anneal=False)
     flip = xy.new_ones(3)
     flip[2] = mirror_sign(points3d)
