@@ -80,7 +80,7 @@ def test_follows_point_order_and_translation(name):
     torch.testing.assert_close(moved.points3d, straight.points3d, atol=float(2e-3 * size), rtol=0)
 
 
-@pytest.mark.parametrize("name", ["logdet", "pnd2", "rigid"])
+@pytest.mark.parametrize("name", ["consensus", "logdet", "pnd2", "rigid"])
 def test_follows_image_rotation(name):
     truth = _world()
     turn = rotation_from_vector(torch.tensor([0.0, 0.0, 0.7]))

@@ -7,14 +7,22 @@ from difflib import get_close_matches
 from torchrecon.errors import ReconError
 from torchrecon.measurement import Solver
 from torchrecon.nrsfm.auto import auto
+from torchrecon.nrsfm.consensus import consensus
 from torchrecon.nrsfm.lowrank import logdet
 from torchrecon.nrsfm.pnd2 import pnd2
 from torchrecon.nrsfm.rigid import rigid
 from torchrecon.nrsfm.trajectory import trajectory
 
-__all__ = ["SOLVERS", "auto", "get_solver", "logdet", "pnd2", "rigid", "trajectory"]
+__all__ = ["SOLVERS", "auto", "consensus", "get_solver", "logdet", "pnd2", "rigid", "trajectory"]
 
-SOLVERS: dict[str, Solver] = {"auto": auto, "logdet": logdet, "pnd2": pnd2, "rigid": rigid, "trajectory": trajectory}
+SOLVERS: dict[str, Solver] = {
+    "auto": auto,
+    "consensus": consensus,
+    "logdet": logdet,
+    "pnd2": pnd2,
+    "rigid": rigid,
+    "trajectory": trajectory,
+}
 
 
 def get_solver(name: str) -> Solver:

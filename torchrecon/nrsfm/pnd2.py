@@ -25,7 +25,16 @@ from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_i
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
-__all__ = ["Pnd2Params", "ProcrusteanNormal", "fit_procrustean", "pnd2", "similarity_tangents"]
+__all__ = [
+    "Pnd2Params",
+    "ProcrusteanNormal",
+    "filled_tracks",
+    "fit_procrustean",
+    "pnd2",
+    "rigid_start",
+    "similarity_tangents",
+    "solve_pnd2",
+]
 
 STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
 LONGEST_TURN = 0.3  # radians that one scoring step may turn a view: beyond it the linearisation says nothing
@@ -238,7 +247,7 @@ def fit_procrustean(
     return model, expected, cost, converged
 
 
-def _filled(data: Observations) -> Tensor:
+def filled_tracks(data: Observations) -> Float[Tensor, "frames points 2"]:
     """Every entry with a value, for the starts alone: a low-rank fit to what was seen."""
     if bool(data.visible.all()):
         return data.xy
@@ -248,13 +257,17 @@ def _filled(data: Observations) -> Tensor:
     return torch.where(data.visible[..., None], data.xy, model.predict())
 
 
-def _rigid_start(xy: Tensor, rotations: Tensor) -> ProcrusteanNormal:
-    """The rigid shape that fits the views best, with no deformation yet."""
-    frames, points, _ = xy.shape
-    shift = xy.mean(1)
-    rows = rotations[:, :2].flatten(0, 1)
-    shape = (torch.linalg.pinv(rows.mT @ rows) @ (rows.mT @ (xy - shift[:, None]).mT.flatten(0, 1))).mT
-    return ProcrusteanNormal(rotations, xy.new_ones(frames), shift, shape, xy.new_zeros(points, 3, 1))
+def rigid_start(
+    xy: Float[Tensor, "*batch frames points 2"], rotations: Float[Tensor, "*batch frames 3 3"]
+) -> ProcrusteanNormal:
+    """The rigid shape that fits complete tracks best under the given views, with no deformation yet."""
+    shift = xy.mean(-2)
+    rows = rotations[..., :2, :].flatten(-3, -2)
+    stack = (xy - shift[..., None, :]).mT.flatten(-3, -2)
+    shape = (torch.linalg.pinv(rows.mT @ rows) @ (rows.mT @ stack)).mT
+    return ProcrusteanNormal(
+        rotations, torch.ones_like(shift[..., 0]), shift, shape, torch.zeros_like(shape)[..., None]
+    )
 
 
 def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2Params | None = None) -> Reconstruction:
@@ -264,11 +277,11 @@ def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2
     kind = data.xy.dtype
     data = replace(data, xy=data.xy.double())
     xy, visible = data.xy, data.visible
-    filled = _filled(data)
+    filled = filled_tracks(data)
     stack = (filled - filled.mean(1, keepdim=True)).mT.flatten(0, 1)
     starts = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
     tried = [
-        fit_procrustean(xy, visible, _rigid_start(filled, views), params.short_iterations, params, anneal=True)
+        fit_procrustean(xy, visible, rigid_start(filled, views), params.short_iterations, params, anneal=True)
         for _, _, views in starts[: params.keep]
     ]
     best = min(tried, key=lambda answer: float(answer[2]))
