@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
+OVERSHOOT = 1.0  # nats per frame by which a step may raise the cost: directions come and go as eps falls
 LONGEST_TURN = 0.3  # radians that one scoring step may turn a view: beyond it the linearisation says nothing
 
 
@@ -123,12 +124,12 @@ def _covariance(lifted: Tensor, rotations: Tensor, missing: Tensor, eps2: float)
 
 
 def _step(
-    xy: Tensor, seen: Tensor, model: ProcrusteanNormal, eps2: float, largest: int
+    xy: Tensor, seen: Tensor, model: ProcrusteanNormal, eps2: float, largest: int, pace: Tensor
 ) -> tuple[ProcrusteanNormal, Tensor, Tensor]:
     """One EM step with one scoring step of the views.
 
     Both start from the same posterior: taking them in turn halves the pace along the valley in which a tilt of the
-    views trades with depth.
+    views trades with depth. Together they can also overshoot, so ``pace`` (batch) shortens the scoring step.
 
     Returns:
         new model; expected camera-frame shapes (F, P, 3) and mean minus twice log-likelihood of the old one.
@@ -181,6 +182,8 @@ def _step(
     change = -torch.linalg.solve(information, gradient[..., None])[..., 0]
     change = change * (LONGEST_TURN / change[..., :3].norm(dim=-1, keepdim=True).clamp_min(LONGEST_TURN))
 
+    change = change * pace[..., None, None]
+
     # moments of the canonical shapes about the old mean
     offset = ((expected - centre) @ rotations / width).flatten(-2)
     shift = offset.mean(-2)
@@ -212,6 +215,23 @@ def _step(
     return new, expected, cost.mean(-1)
 
 
+def _choose(which: Tensor, first: ProcrusteanNormal, second: ProcrusteanNormal) -> ProcrusteanNormal:
+    """Batch items of ``first`` where ``which`` holds, else of ``second``; loadings are padded with zeros."""
+    rank = max(first.loadings.shape[-1], second.loadings.shape[-1])
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(which.reshape(*which.shape, *(1,) * (a.ndim - which.ndim)), a, b)
+
+    pad = torch.nn.functional.pad
+    return ProcrusteanNormal(
+        pick(first.rotations, second.rotations),
+        pick(first.scale, second.scale),
+        pick(first.translation, second.translation),
+        pick(first.mean, second.mean),
+        pick(*(pad(model.loadings, (0, rank - model.loadings.shape[-1])) for model in (first, second))),
+    )
+
+
 def fit_procrustean(
     xy: Float[Tensor, "*batch frames points 2"],
     visible: Bool[Tensor, "*batch frames points"],
@@ -234,17 +254,24 @@ def fit_procrustean(
     seen = visible.to(xy.dtype)
     falling = 0.9 * iterations if anneal else 0.0
     ratio = params.eps_fine / params.eps_coarse
-    previous, converged = torch.full(seen.shape[:-2], torch.inf, dtype=xy.dtype, device=xy.device), False
+    pace = xy.new_ones(seen.shape[:-2])
+    lowest = previous = torch.full_like(pace, torch.inf)
+    good, converged = model, False
     for index in range(iterations):
         eps = params.eps_coarse * ratio ** (index / falling) if index < falling else params.eps_fine
-        model, _, cost = _step(xy, seen, model, eps**2, params.largest_rank)
+        new, _, cost = _step(xy, seen, model, eps**2, params.largest_rank, pace)
+        worse = ~(cost <= lowest + OVERSHOOT)
+        lowest = torch.where(worse, lowest, cost)
+        good = _choose(worse, good, model)
+        model = _choose(worse, good, new)
+        pace = torch.where(worse, pace / 2, (1.2 * pace).clamp(max=1))
         if index >= falling and index % 10 == 9:
-            if bool(((previous - cost).abs() < 10 * params.tolerance).all()):
+            if bool(((previous - lowest).abs() < 10 * params.tolerance).all()) and bool((pace == 1).all()):
                 converged = True
                 break
-            previous = cost
-    _, expected, cost = _step(xy, seen, model, params.eps_fine**2, params.largest_rank)
-    return model, expected, cost, converged
+            previous = lowest
+    _, expected, cost = _step(xy, seen, good, params.eps_fine**2, params.largest_rank, pace)
+    return good, expected, cost, converged
 
 
 def filled_tracks(data: Observations) -> Float[Tensor, "frames points 2"]:
