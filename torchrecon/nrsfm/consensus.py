@@ -23,8 +23,8 @@ from torchrecon.linalg import nearest_rotation
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
 from torchrecon.nrsfm.observations import observe
-from torchrecon.nrsfm.pnd2 import Pnd2Params, filled_tracks, fit_procrustean, rigid_start
-from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
+from torchrecon.nrsfm.pnd2 import Pnd2Params, filled_tracks, first_views, fit_procrustean, rigid_start
+from torchrecon.nrsfm.upgrade import UpgradeParams
 
 __all__ = ["ConsensusParams", "agree_on_depth", "agree_on_sign", "consensus", "draw_groups"]
 
@@ -168,12 +168,12 @@ def solve_consensus(
     data = replace(data, xy=data.xy.double())
     filled = filled_tracks(data)
     centred = filled - filled.mean(1, keepdim=True)
-    starts = sorted(upgraded_rotations(centred.mT.flatten(0, 1), params.upgrade, generator), key=lambda start: start[0])
+    starts = first_views(filled, params.upgrade, params.keep, generator)
     index = draw_groups(filled, params.size, params.uses, generator)
     xy = data.xy[:, index].transpose(0, 1)
     visible = data.visible[:, index].transpose(0, 1)
     shapes, costs = [], []
-    for _, _, views in starts[: params.keep]:
+    for views in starts:
         begin = rigid_start(filled[:, index].transpose(0, 1), views.expand(len(index), *views.shape))
         model, expected, cost, _ = fit_procrustean(xy, visible, begin, params.iterations, params.weak, anneal=True)
         plane = expected[..., :2] + model.translation[..., None, :]
@@ -194,7 +194,7 @@ def solve_consensus(
     flip = xy.new_ones(3)
     flip[2] = mirror_sign(points3d)
     points3d = points3d * flip
-    views = starts[0][2]
+    views = starts[0]
     rotations, size = _aligned(
         points3d, [views, views * (xy.new_tensor([1, 1, -1])[:, None] * xy.new_tensor([1, 1, -1]))]
     )

@@ -29,6 +29,7 @@ __all__ = [
     "Pnd2Params",
     "ProcrusteanNormal",
     "filled_tracks",
+    "first_views",
     "fit_procrustean",
     "pnd2",
     "rigid_start",
@@ -297,6 +298,22 @@ def rigid_start(
     )
 
 
+def first_views(
+    filled: Float[Tensor, "frames points 2"], params: UpgradeParams, keep: int, generator: torch.Generator
+) -> list[Float[Tensor, "frames 3 3"]]:
+    """Views of the metric upgrade, lowest residual first.
+
+    Only those K are tried whose 3K columns stand above rounding: noise-free tracks of degenerate shapes have fewer,
+    and the rest would fit the metric constraints with noise.
+    """
+    stack = (filled - filled.mean(1, keepdim=True)).mT.flatten(0, 1)
+    singular = torch.linalg.svdvals(stack)
+    available = int((singular > 1e-6 * singular[0]).sum())
+    ranks = tuple(k for k in params.ranks if k == min(params.ranks) or 3 * k <= available)
+    starts = sorted(upgraded_rotations(stack, replace(params, ranks=ranks), generator), key=lambda start: start[0])
+    return [views for _, _, views in starts[:keep]]
+
+
 def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2Params | None = None) -> Reconstruction:
     """Solve one sequence (batch ``()``); works in float64 whatever the tracks are."""
     params = params or Pnd2Params()
@@ -305,11 +322,9 @@ def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2
     data = replace(data, xy=data.xy.double())
     xy, visible = data.xy, data.visible
     filled = filled_tracks(data)
-    stack = (filled - filled.mean(1, keepdim=True)).mT.flatten(0, 1)
-    starts = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
     tried = [
         fit_procrustean(xy, visible, rigid_start(filled, views), params.short_iterations, params, anneal=True)
-        for _, _, views in starts[: params.keep]
+        for views in first_views(filled, params.upgrade, params.keep, generator)
     ]
     best = min(tried, key=lambda answer: float(answer[2]))
     model, points3d, _, converged = fit_procrustean(xy, visible, best[0], params.long_iterations, params, anneal=False)
@@ -318,7 +333,7 @@ def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2
     points3d, rotations = points3d * flip, model.rotations * (flip[:, None] * flip)
     turn = float(turn_of_view(rotations))
     status = check_size(item, 1)
-    if status is None and (turn < STATIC_TURN or looks_static(stack.unflatten(0, (-1, 2)).mT)):
+    if status is None and (turn < STATIC_TURN or looks_static(filled - filled.mean(1, keepdim=True))):
         status = Status(
             "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
         )
