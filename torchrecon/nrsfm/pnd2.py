@@ -8,7 +8,9 @@ Recalled from the papers: this distribution, EM with the depths latent, no K. De
 ``L L^T + eps^2 I`` whose L takes the directions that exceed ``eps^2`` (so every frame costs r x r algebra), views and
 sizes by Fisher scoring on the marginal likelihood in place of a re-alignment of the expected shapes (which stops
 far from the optimum), and the annealing of eps. It is not the authors' code and has no motion prior from frame to
-frame. Not used: measured depth, the covariance of observations. Cost: linear in frames, cubic in points.
+frame. Not used: measured depth, the covariance of observations. eps does not learn the noise:
+what exceeds its last value is taken for deformation, so on noisy tracks ``eps_fine`` has to be raised to the noise.
+Cost: linear in frames, cubic in points.
 """
 
 from __future__ import annotations
