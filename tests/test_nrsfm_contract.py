@@ -46,7 +46,7 @@ def test_exact_on_clean_rigid_data(name):
     torch.testing.assert_close(rec.points3d.mean(-2), torch.zeros(40, 3), atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["auto", "em_ppca"])
+@pytest.mark.parametrize("name", ["auto", "em_ppca", "pnd2"])
 def test_exact_on_clean_rank_3k_data(name):
     truth = _world(rank=2, frames=60, points=24)
     rec = get_solver(name)(Tracks(truth[..., :2]), 2)
@@ -55,7 +55,7 @@ def test_exact_on_clean_rank_3k_data(name):
     assert rec.basis.shape == (2, 24, 3)
 
 
-@pytest.mark.parametrize("name", ["auto", "rigid", *KNOWN_METHODS])
+@pytest.mark.parametrize("name", ["auto", "pnd2", "rigid", *KNOWN_METHODS])
 def test_error_grows_in_step_with_the_noise(name):
     truth = _world()
     noise = torch.randn(truth[..., :2].shape, generator=torch.Generator().manual_seed(1))
@@ -68,7 +68,7 @@ def test_error_grows_in_step_with_the_noise(name):
     assert 0.7 < slope < 1.3, errors.tolist()
 
 
-@pytest.mark.parametrize("name", ["logdet", "rigid", "trajectory", *KNOWN_METHODS])
+@pytest.mark.parametrize("name", ["logdet", "pnd2", "rigid", "trajectory", *KNOWN_METHODS])
 def test_follows_point_order_and_translation(name):
     truth = _world()
     solve = get_solver(name)
@@ -81,7 +81,7 @@ def test_follows_point_order_and_translation(name):
     torch.testing.assert_close(moved.points3d, straight.points3d, atol=float(2e-3 * size), rtol=0)
 
 
-@pytest.mark.parametrize("name", ["logdet", "rigid", *KNOWN_METHODS])
+@pytest.mark.parametrize("name", ["consensus", "logdet", "pnd2", "rigid", *KNOWN_METHODS])
 def test_follows_image_rotation(name):
     truth = _world()
     turn = rotation_from_vector(torch.tensor([0.0, 0.0, 0.7]))

@@ -8,23 +8,41 @@ from torchrecon.errors import ReconError
 from torchrecon.measurement import Solver
 from torchrecon.nrsfm.auto import auto
 from torchrecon.nrsfm.bmm import bmm
+from torchrecon.nrsfm.consensus import consensus
 from torchrecon.nrsfm.csf import csf
 from torchrecon.nrsfm.em_ppca import em_ppca
 from torchrecon.nrsfm.lowrank import logdet
 from torchrecon.nrsfm.marginal import marginal
+from torchrecon.nrsfm.pnd2 import pnd2
 from torchrecon.nrsfm.pta import pta
 from torchrecon.nrsfm.rigid import rigid
 from torchrecon.nrsfm.trajectory import trajectory
 
-__all__ = ["SOLVERS", "auto", "bmm", "csf", "em_ppca", "get_solver", "logdet", "marginal", "pta", "rigid", "trajectory"]
+__all__ = [
+    "SOLVERS",
+    "auto",
+    "bmm",
+    "consensus",
+    "csf",
+    "em_ppca",
+    "get_solver",
+    "logdet",
+    "marginal",
+    "pnd2",
+    "pta",
+    "rigid",
+    "trajectory",
+]
 
 SOLVERS: dict[str, Solver] = {
     "auto": auto,
     "bmm": bmm,
+    "consensus": consensus,
     "csf": csf,
     "em_ppca": em_ppca,
     "logdet": logdet,
     "marginal": marginal,
+    "pnd2": pnd2,
     "pta": pta,
     "rigid": rigid,
     "trajectory": trajectory,

@@ -120,6 +120,9 @@ def solve_marginal(
     dtype = item.xy.dtype
     with torch.no_grad():
         data = observe(item.to(dtype=torch.float64))
+        small = check_size(item, 1) or _shapeless(data)
+        if small is not None:
+            return _flat(data, rank, small).to(dtype=dtype)
         filled = _filled(data, params.fill_rank)
         centred = filled - filled.mean(1, keepdim=True)
         stack = centred.mT.flatten(0, 1)
@@ -174,6 +177,24 @@ def _reconstruction(
         status=status,
         covariance3d=covariance * both,
     )
+
+
+def _shapeless(data: Observations) -> Status | None:
+    """A status where all seen points of every frame lie in one place."""
+    count = data.visible.sum(1).clamp_min(1)[:, None]
+    rest = torch.where(data.visible[..., None], data.xy - (data.xy.sum(1) / count)[:, None], data.xy.new_zeros(()))
+    if float(rest.abs().max()) > 1e-9:
+        return None
+    return Status("degenerate", "in every frame all points that are seen lie in one place; there is no shape to find")
+
+
+def _flat(data: Observations, rank: int, status: Status) -> Reconstruction:
+    """What can be said where a solve cannot begin: the points as they are seen, without depth."""
+    xy = data.held()
+    translation = xy.mean(1)
+    points3d = torch.cat([xy - translation[:, None], torch.zeros_like(xy[..., :1])], -1)
+    eye = torch.eye(3, dtype=xy.dtype, device=xy.device).expand(len(xy), 3, 3)
+    return data.reconstruction(points3d, eye, torch.ones_like(xy[:, 0, 0]), translation, rank=rank, status=status)
 
 
 def _status(data: Observations, rank: int, rotations: Tensor, converged: bool, tried: int) -> Status:

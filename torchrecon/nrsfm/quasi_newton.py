@@ -65,9 +65,10 @@ def _metric(model: ShapeModel, fisher: Tensor, residual: Tensor) -> Callable[[Di
     """The inverse information of poses, mean and loadings, as a function on gradients."""
     frames, modes = model.scale.shape[-1], model.loadings.shape[-1]
     eye = torch.eye(4, dtype=fisher.dtype, device=fisher.device)
-    # A pose that the frame does not determine keeps its place.
-    size = fisher.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
-    factor = torch.linalg.cholesky(fisher + (1e-6 * size + torch.finfo(size.dtype).tiny) * eye)
+    size = fisher.diagonal(dim1=-2, dim2=-1).mean(-1)
+    # A frame that shows nothing has no information of its own; its pose keeps its place.
+    ridge = 1e-6 * size + 1e-9 * size.amax(-1, keepdim=True)
+    factor = torch.linalg.cholesky(fisher + ridge[..., None, None] * eye)
     flat = model.loadings.flatten(-3, -2)
 
     def spread(gradient: Tensor) -> Tensor:
