@@ -173,8 +173,8 @@ def _crowd(shape: Tensor, visible: Tensor, spacing: float) -> Tensor:
     # Frame by frame: the pairs of one frame stay in the processor's cache, those of a clip do not.
     for place, shown in zip(shape.reshape(-1, count, 3), visible.reshape(-1, count), strict=True):
         place = place[shown]
-        square = place.square().sum(-1)
-        apart = torch.addmm(square[:, None] + square, place, place.T, alpha=-2)
+        # By differences: |a|^2 + |b|^2 - 2 a.b loses the digits of near neighbours, and with them the order of points.
+        apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist").square()
         near = (1 - apart / spacing**2).clamp(0, 1).sum(-1).clamp_min(1)
         crowds.append(near.new_ones(count).masked_scatter(shown, near))
     return torch.stack(crowds).reshape(visible.shape)

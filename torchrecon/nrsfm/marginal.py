@@ -52,14 +52,14 @@ class MarginalParams:
     upgrade: UpgradeParams = field(default_factory=UpgradeParams)
     descent: DescentParams = field(default_factory=DescentParams)
     coarse: float = 0.1
-    fine: float = 0.003
+    fine: float = 0.004
     finest: float = 0.0001
     levels: int = 8
     trial_levels: int = 2
-    starts: int = 2
+    starts: int = 1
     gram_bases: tuple[int, ...] = (2, 3)
     steps: int = 15
-    last_steps: int = 100
+    last_steps: int = 120
     growths: int = 2
     modes: int = 40
     fill_rank: int = 9
@@ -82,7 +82,9 @@ def _filled(data: Observations, rank: int) -> Tensor:
     if bool(data.visible.all()):
         return data.xy
     model = start_factors(data.xy, data.visible)
-    for _ in range(rank // 3):
+    first = model.noise
+    # Nothing is left to fit once a fit is exact.
+    while model.rows.shape[-1] < rank and model.noise > 1e-8 * first:
         model = fit_factors(grow_factors(model, data.xy, data.visible, 3), data.xy, data.visible)
     return torch.where(data.visible[..., None], data.xy, model.predict())
 

@@ -31,7 +31,7 @@ class DescentParams:
     """
 
     memory: int = 20
-    tolerance: float = 1e-3
+    tolerance: float = 3e-4
     turn: float = 0.4
     halvings: int = 8
     sufficient: float = 1e-4
@@ -66,8 +66,9 @@ def _metric(model: ShapeModel, fisher: Tensor, residual: Tensor) -> Callable[[Di
     frames, modes = model.scale.shape[-1], model.loadings.shape[-1]
     eye = torch.eye(4, dtype=fisher.dtype, device=fisher.device)
     size = fisher.diagonal(dim1=-2, dim2=-1).mean(-1)
-    # A frame that shows nothing has no information of its own; its pose keeps its place.
-    ridge = 1e-6 * size + 1e-9 * size.amax(-1, keepdim=True)
+    # A frame that shows nothing has no information of its own; only the common scale moves its pose, and little.
+    most = size.amax(-1, keepdim=True)
+    ridge = 1e-6 * size + torch.where(size < 1e-6 * most, most, torch.zeros_like(size))
     factor = torch.linalg.cholesky(fisher + ridge[..., None, None] * eye)
     flat = model.loadings.flatten(-3, -2)
 
