@@ -137,15 +137,15 @@ def settle(
     """
     if params.views == ("camera",):  # depth must not leak in through centre and size either
         points3d = torch.cat([points3d[..., :2], torch.zeros_like(points3d[..., 2:])], -1)
-    shape = torch.where(visible[..., None], points3d, torch.zeros_like(points3d)).to(torch.float32)
+    # In float64: the equations of the sway and the distances of near neighbours lose too many digits for float32.
+    shape = torch.where(visible[..., None], points3d, torch.zeros_like(points3d)).to(torch.float64)
     if not torch.isfinite(shape).all():
         where = torch.nonzero(~torch.isfinite(shape).all(-1))[0].tolist()
         raise ReconError(f"read_out: points3d at index {where} is marked visible but not finite; unmark or fill it")
     if not visible.any(-1).any(-1).all():
         raise ReconError("read_out: nothing is visible in the clip; a shape needs observed points")
-    rotations = camera_rotations.to(torch.float32)
-    weight = visible.to(torch.float32)
-    # The mean first: it makes a translation of any size harmless to the float32 steps that follow.
+    rotations = camera_rotations.to(torch.float64)
+    weight = visible.to(torch.float64)
     shape = shape - _weighted_mean(shape, weight)
     shape = shape / _rms_size(shape, weight)
     weight = weight / _crowd(shape, visible, params.spacing)
@@ -160,7 +160,7 @@ def settle(
     kept = visible.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[..., :fullest]
     world = world.gather(-2, kept[..., None].expand(*kept.shape, 3))
     camera = world if params.views == ("camera",) else world @ rotations.transpose(-1, -2)
-    return Settled(world, camera[..., :2], weight.gather(-1, kept))
+    return Settled(world.float(), camera[..., :2].float(), weight.gather(-1, kept).float())
 
 
 def _crowd(shape: Tensor, visible: Tensor, spacing: float) -> Tensor:
@@ -173,8 +173,8 @@ def _crowd(shape: Tensor, visible: Tensor, spacing: float) -> Tensor:
     # Frame by frame: the pairs of one frame stay in the processor's cache, those of a clip do not.
     for place, shown in zip(shape.reshape(-1, count, 3), visible.reshape(-1, count), strict=True):
         place = place[shown]
-        # By differences: |a|^2 + |b|^2 - 2 a.b loses the digits of near neighbours, and with them the order of points.
-        apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist").square()
+        square = place.square().sum(-1)
+        apart = torch.addmm(square[:, None] + square, place, place.T, alpha=-2)
         near = (1 - apart / spacing**2).clamp(0, 1).sum(-1).clamp_min(1)
         crowds.append(near.new_ones(count).masked_scatter(shown, near))
     return torch.stack(crowds).reshape(visible.shape)
