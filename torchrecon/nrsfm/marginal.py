@@ -52,14 +52,14 @@ class MarginalParams:
     upgrade: UpgradeParams = field(default_factory=UpgradeParams)
     descent: DescentParams = field(default_factory=DescentParams)
     coarse: float = 0.1
-    fine: float = 0.004
+    fine: float = 0.003
     finest: float = 0.0001
     levels: int = 8
     trial_levels: int = 2
     starts: int = 1
     gram_bases: tuple[int, ...] = (2, 3)
     steps: int = 15
-    last_steps: int = 120
+    last_steps: int = 100
     growths: int = 2
     modes: int = 40
     fill_rank: int = 9

@@ -31,7 +31,7 @@ class DescentParams:
     """
 
     memory: int = 20
-    tolerance: float = 3e-4
+    tolerance: float = 5e-4
     turn: float = 0.4
     halvings: int = 8
     sufficient: float = 1e-4
