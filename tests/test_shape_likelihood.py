@@ -35,14 +35,16 @@ def _dense(views: Views, model: ShapeModel, item: int, frame: int):
     rows = model.scale[item, frame] * model.rotations[item, frame, :2]
     mean = (model.mean[item, seen] @ rows.T).reshape(-1)
     loading = torch.einsum("ci,pik->pck", rows, model.loadings[item, seen]).reshape(-1, MODES)
-    noise = torch.block_diag(*[views.noise[item, frame, p] + EPS**2 * torch.eye(2) for p in seen.tolist()])
+    noise = torch.block_diag(
+        *[views.noise[item, frame, p] + (model.scale[item, frame] * EPS) ** 2 * torch.eye(2) for p in seen.tolist()]
+    )
     shift = torch.eye(2).repeat(len(seen), 1)
     return seen, mean, loading @ loading.T + noise + 1e9 * shift @ shift.T
 
 
 def test_value_is_that_of_a_dense_gaussian():
     views, model = _problem()
-    value = evaluate(views, views.whitener(EPS), model, EPS).value
+    value = evaluate(views, model, EPS).value
     for item in range(B):
         total = torch.zeros(())
         for frame in range(F):
@@ -60,22 +62,22 @@ def test_gradient_is_that_of_finite_differences():
     mean = mean - mean.mean(-2, keepdim=True)
     loadings = torch.randn(B, 3 * P, MODES, generator=g)
     loadings = (loadings - model.avoided @ (model.avoided.mT @ loadings)).view(B, P, 3, MODES)
-    whitener = views.whitener(EPS)
-    ends = [evaluate(views, whitener, moved(model, h * pose, h * mean, h * loadings), EPS).value for h in (1e-5, -1e-5)]
-    at = evaluate(views, whitener, model, EPS)
+    ends = [evaluate(views, moved(model, h * pose, h * mean, h * loadings), EPS).value for h in (1e-5, -1e-5)]
+    at = evaluate(views, model, EPS)
     slope = (at.pose * pose).sum((-1, -2)) + (at.mean * mean).sum((-1, -2)) + (at.loadings * loadings).sum((-1, -2, -3))
     torch.testing.assert_close((ends[0] - ends[1]) / 2e-5, slope, rtol=1e-6, atol=1e-5)
 
 
 def test_points_and_spread_are_the_posterior_of_the_shapes():
     views, model = _problem()
-    at = evaluate(views, views.whitener(EPS), model, EPS, with_spread=True)
+    at = evaluate(views, model, EPS, with_spread=True)
     item, frame = 1, 3
     pose = model.scale[item, frame] * model.rotations[item, frame]
     seen, mean, covariance = _dense(views, model, item, frame)
     # All camera coordinates of all points, jointly with the seen ones; the residual is isotropic.
     loading = torch.einsum("ci,pik->pck", pose, model.loadings[item]).reshape(3 * P, MODES)
-    prior = loading @ loading.T + EPS**2 * torch.eye(3 * P)
+    variance = (model.scale[item, frame] * EPS) ** 2
+    prior = loading @ loading.T + variance * torch.eye(3 * P)
     index = torch.stack([3 * seen, 3 * seen + 1], 1).reshape(-1)
     rest = views.xy[item, frame, seen].reshape(-1) - mean
     expected = (model.mean[item] @ pose.T).reshape(-1) + prior[:, index] @ torch.linalg.solve(covariance, rest)
@@ -85,17 +87,17 @@ def test_points_and_spread_are_the_posterior_of_the_shapes():
     residual = (left - spread @ spread.T).view(P, 3, P, 3)
     blocks = residual[range(P), :, range(P), :]
     # What the weights do not explain is the residual: eps^2 in depth, less in the axes that were measured.
-    torch.testing.assert_close(blocks[:, 2, 2], torch.full((P,), EPS**2), rtol=1e-5, atol=1e-5)
-    assert bool((blocks[:, 0, 0] < EPS**2 + 1e-6).all())
+    torch.testing.assert_close(blocks[:, 2, 2], variance.expand(P), rtol=1e-5, atol=1e-5)
+    assert bool((blocks[:, 0, 0] < variance + 1e-6).all())
 
 
 def test_unseen_entries_and_neighbours_in_the_batch_change_nothing():
     views, model = _problem()
     wild = Views(torch.where(views.visible[..., None], views.xy, 1e3), views.visible, views.noise)
-    whole = evaluate(views, views.whitener(EPS), model, EPS)
-    other = evaluate(wild, wild.whitener(EPS), model, EPS)
+    whole = evaluate(views, model, EPS)
+    other = evaluate(wild, model, EPS)
     single = Views(views.xy[1:], views.visible[1:], views.noise[1:])
-    alone = evaluate(single, single.whitener(EPS), model.pick(1), EPS)
+    alone = evaluate(single, model.pick(1), EPS)
     for part in fields(whole):
         if part.name == "spread":
             continue
@@ -116,19 +118,16 @@ def test_growth_raises_the_likelihood_and_descent_finds_the_shapes():
     views = Views(xy, torch.ones(1, 40, 15, dtype=torch.bool), torch.zeros(1, 40, 15, 2, 2))
     model = ShapeModel(turn[None], torch.ones(1, 40), mean[None], torch.zeros(1, 15, 3, 0), avoided[None])
     eps = 0.02
-    whitener = views.whitener(eps)
     values = []
     for _ in range(10):
-        model = grow_loadings(views, whitener, model, eps, 10)
-        values.append(float(evaluate(views, whitener, model, eps).value))
+        model = grow_loadings(views, model, eps, 10)
+        values.append(float(evaluate(views, model, eps).value))
     assert max(later - now for now, later in pairwise(values)) < 0
     for _ in range(4):
-        model, value, _ = descend(
-            views, whitener, grow_loadings(views, whitener, model, eps, 10), eps, 20, DescentParams()
-        )
+        model, value, _ = descend(views, grow_loadings(views, model, eps, 10), eps, 20, DescentParams())
     assert float(value) < values[-1]
     assert model.loadings.shape[-1] == 2  # as many as were put in
-    points, truth = evaluate(views, whitener, model, eps).points[0], shapes @ turn.mT
+    points, truth = evaluate(views, model, eps).points[0], shapes @ turn.mT
     truth = truth - truth.mean(1, keepdim=True)
     assert float((points - points.mean(1, keepdim=True) - truth).norm() / truth.norm()) < 0.02
 
@@ -136,7 +135,7 @@ def test_growth_raises_the_likelihood_and_descent_finds_the_shapes():
 @pytest.mark.parametrize("item", [0, 1])
 def test_descent_of_a_batch_is_that_of_its_items(item):
     views, model = _problem()
-    both, _, _ = descend(views, views.whitener(EPS), model, EPS, 6, DescentParams())
+    both, _, _ = descend(views, model, EPS, 6, DescentParams())
     single = Views(views.xy[item : item + 1], views.visible[item : item + 1], views.noise[item : item + 1])
-    alone, _, _ = descend(single, single.whitener(EPS), model.pick(item), EPS, 6, DescentParams())
+    alone, _, _ = descend(single, model.pick(item), EPS, 6, DescentParams())
     torch.testing.assert_close(both.pick(item).rotations, alone.rotations, rtol=1e-5, atol=1e-6)

@@ -137,11 +137,10 @@ def solve_marginal(
         fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
         eps, level, before = params.coarse, 0, -1
         while True:
-            whitener = views.whitener(eps).expand(len(model.scale), *views.noise.shape)
             for _ in range(params.growths):
-                model = grow_loadings(views, whitener, model, eps, params.modes)
+                model = grow_loadings(views, model, eps, params.modes)
             steps = params.last_steps if level == params.levels - 1 else params.steps
-            model, value, converged = descend(views, whitener, model, eps, steps, params.descent)
+            model, value, converged = descend(views, model, eps, steps, params.descent)
             if level == params.trial_levels - 1:
                 model = model.pick(int(value.argmin()))
             # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly.
@@ -149,13 +148,13 @@ def solve_marginal(
             if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
                 break
             eps, level, before = eps * fall, level + 1, modes
-        answer = evaluate(views, views.whitener(eps)[None], model, eps, with_spread=True)
+        answer = evaluate(views, model, eps, with_spread=True)
         status = _status(data, rank, model.rotations[0], converged, len(rotations))
-        return _reconstruction(data, model, answer, eps, rank, status).to(dtype=dtype)
+        return _reconstruction(data, views, model, answer, eps, rank, status).to(dtype=dtype)
 
 
 def _reconstruction(
-    data: Observations, model: ShapeModel, answer: Evaluation, eps: float, rank: int, status: Status
+    data: Observations, views: Views, model: ShapeModel, answer: Evaluation, eps: float, rank: int, status: Status
 ) -> Reconstruction:
     """The posterior mean of the shapes as seen, in the container's units.
 
@@ -164,8 +163,12 @@ def _reconstruction(
     """
     assert answer.spread is not None
     points3d, rotations = answer.points[0], model.rotations[0]
-    # Weights and translation leave the spread, the residual an isotropic rest that the image measures in two axes.
-    residual = points3d.new_tensor([0.0, 0.0, eps**2]).diag()
+    # Weights and translation leave the spread; the residual leaves what the image does not measure of it.
+    variance = (eps * model.scale[0]).square()
+    whitener = views.whitener(variance)
+    measured = variance[:, None, None, None] * (whitener.mT @ whitener)
+    eye = torch.eye(3, dtype=points3d.dtype, device=points3d.device)
+    residual = variance[:, None, None, None] * (eye - torch.nn.functional.pad(measured, (0, 1, 0, 1)))
     covariance = answer.spread[0] @ answer.spread[0].mT + residual
     flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
     flip[2] = mirror_sign(points3d)

@@ -87,7 +87,7 @@ def _metric(model: ShapeModel, fisher: Tensor, residual: Tensor) -> Callable[[Di
 
 
 def descend(
-    views: Views, whitener: Tensor, model: ShapeModel, eps: float, steps: int, params: DescentParams
+    views: Views, model: ShapeModel, eps: float, steps: int, params: DescentParams
 ) -> tuple[ShapeModel, Tensor, bool]:
     """At most ``steps`` steps from a model with one leading batch dimension.
 
@@ -96,7 +96,7 @@ def descend(
     """
     frames = model.scale.shape[-1]
     residual = (views.noise.diagonal(dim1=-2, dim2=-1).mean((-1, -2, -3)) + eps**2).expand(len(model.scale))
-    now = evaluate(views, whitener, model, eps)
+    now = evaluate(views, model, eps)
     pairs: list[tuple[Direction, Direction, Tensor]] = []
     done = torch.zeros_like(now.value, dtype=torch.bool)
     for _ in range(steps):
@@ -122,7 +122,7 @@ def descend(
         for _ in range(params.halvings):
             step = _scaled(-length, q)
             trial = moved(model, *step)
-            then = evaluate(views, whitener, trial, eps)
+            then = evaluate(views, trial, eps)
             good = (then.value <= now.value + params.sufficient * length * slope) | (length == 0)
             if bool(good.all()):
                 break
@@ -131,7 +131,7 @@ def descend(
         if not bool(good.all()):
             step = _scaled(-length, q)
             trial = moved(model, *step)
-            then = evaluate(views, whitener, trial, eps)
+            then = evaluate(views, trial, eps)
         change = _add(_gradient(then), -torch.ones_like(length), _gradient(now))
         curvature = _dot(step, change)
         usable = curvature > 1e-10 * (length * slope).abs()

@@ -37,12 +37,18 @@ class Views:
     visible: Bool[Tensor, "*b frames points"]
     noise: Float[Tensor, "*b frames points 2 2"]
 
-    def whitener(self, eps: float) -> Float[Tensor, "*b frames points 2 2"]:
-        """K with ``K^T K`` the inverse of noise plus residual; zero where nothing is seen."""
-        eye = torch.eye(2, dtype=self.xy.dtype, device=self.xy.device)
-        factor = torch.linalg.cholesky(self.noise + eps**2 * eye)
-        inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
-        return inverse * self.visible[..., None, None]
+    def whitener(self, residual: Float[Tensor, "*b frames"]) -> Float[Tensor, "*b frames points 2 2"]:
+        """K with ``K^T K`` the inverse of noise plus residual; zero where nothing is seen.
+
+        Args:
+            residual: variance of the residual in the image.
+        """
+        xx = self.noise[..., 0, 0] + residual[..., None]
+        yx, yy = self.noise[..., 1, 0], self.noise[..., 1, 1] + residual[..., None]
+        first = xx.rsqrt()
+        second = (yy - yx.square() / xx).rsqrt()
+        rows = torch.stack([first, torch.zeros_like(first), -yx / xx * second, second], -1).unflatten(-1, (2, 2))
+        return rows * self.visible[..., None, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +136,11 @@ def _spread(placed: Tensor, factor: Tensor, gain: Tensor) -> Tensor:
     return (kept.flatten(-3, -2) @ root[..., : kept.shape[-1], :]).unflatten(-2, kept.shape[-3:-1])
 
 
-def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float, *, with_spread: bool = False) -> Evaluation:
-    """Minus the log-likelihood with its gradient, see the module's text; ``whitener`` is that of ``views`` at eps."""
+def evaluate(views: Views, model: ShapeModel, eps: float, *, with_spread: bool = False) -> Evaluation:
+    """Minus the log-likelihood with its gradient, see the module's text; ``eps`` is the deviation of the residual."""
     modes = model.loadings.shape[-1]
+    residual = (eps * model.scale).square()
+    whitener = views.whitener(residual)
     placed = _placed(model)
     plane = placed[..., :2, :, :].transpose(-3, -2)  # (*b, frames, points, 2, 1 + modes)
     seen = views.visible[..., None]
@@ -159,6 +167,11 @@ def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float, *, w
     x, y, z = placed.flatten(-2).unbind(-2)
     gx, gy = stacked.unbind(-2)
     pose = torch.stack([-(gy * z).sum(-1), (gx * z).sum(-1), (gy * x - gx * y).sum(-1), (gx * x + gy * y).sum(-1)], -1)
+    # The residual grows with the scale: s^2 eps^2 (tr C^-1 - |C^-1 e|^2), with C^-1 = K^T (I - design G^-1 design^T) K.
+    within = whitener.mT @ design.unflatten(-2, (plane.shape[-3], 2))
+    known = torch.linalg.solve_triangular(factor, within.flatten(-3, -2).mT, upper=False).square().sum((-1, -2))
+    pull = slope[..., 0].square().sum((-1, -2))
+    pose[..., 3] += residual * (whitener.square().sum((-1, -2, -3)) - known - pull)
     pose[..., 3] -= pose[..., 3].mean(-1, keepdim=True)
     mean, loadings = basis[..., 0], basis[..., 1:]
     flat = loadings.flatten(-3, -2)
@@ -168,7 +181,7 @@ def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float, *, w
     average = torch.cat([torch.ones_like(weights[..., :1, 0]), weights[..., :modes, 0]], -1)
     fitted = torch.einsum("...cpk,...k->...pc", placed, average)
     translation = weights[..., modes:, 0]
-    gain = eps**2 * whitener.mT @ whitener
+    gain = residual[..., None, None, None] * (whitener.mT @ whitener)
     loose = error - (fitted[..., :2] - plane[..., 0]) - translation[..., None, :]
     inplane = fitted[..., :2] + (gain @ torch.where(seen, loose, loose.new_zeros(()))[..., None])[..., 0]
     points = torch.cat([inplane, fitted[..., 2:]], -1)
@@ -180,13 +193,13 @@ def evaluate(views: Views, whitener: Tensor, model: ShapeModel, eps: float, *, w
     return Evaluation(value, pose, mean - mean.mean(-2, keepdim=True), loadings, fisher, points, spread, translation)
 
 
-def grow_loadings(views: Views, whitener: Tensor, model: ShapeModel, eps: float, most: int) -> ShapeModel:
+def grow_loadings(views: Views, model: ShapeModel, eps: float, most: int) -> ShapeModel:
     """One step of expectation-maximisation for mean and loadings: principal directions of the expected covariance.
 
     Directions whose variance exceeds that of the residual become modes, at most ``most``: the number of modes finds
     itself. Loadings of fewer modes are padded with zeros to the largest of the batch.
     """
-    now = evaluate(views, whitener, model, eps, with_spread=True)
+    now = evaluate(views, model, eps, with_spread=True)
     assert now.spread is not None
     back = model.rotations / model.scale[..., None, None]
     shapes = now.points @ back
@@ -199,7 +212,9 @@ def grow_loadings(views: Views, whitener: Tensor, model: ShapeModel, eps: float,
     rows = torch.cat([data, doubt], -2) / frames**0.5
     avoided, _ = torch.linalg.qr(tangents(mean))
     rows = rows - (rows @ avoided) @ avoided.mT
-    gain = (eps**2 * (whitener * whitener).sum((-1, -2))).mean((-1, -2))  # 2 for exact, 0 for unseen entries
+    variance = (eps * model.scale).square()
+    measured = views.whitener(variance).square().sum((-1, -2)) * variance[..., None]
+    gain = measured.mean((-1, -2))  # 2 for exact, 0 for unseen entries
     residual = eps**2 * (1 - gain / 3)
     if rows.shape[-2] <= rows.shape[-1]:
         values, left = torch.linalg.eigh(rows @ rows.mT)
