@@ -42,8 +42,10 @@ class MarginalParams:
         trial_levels: levels after which the likeliest start is kept (count).
         starts: starts from the metric upgrade, lowest residual first (count).
         gram_bases: numbers of bases for which the upgrade of least trace supplies one more start (count).
-        steps: quasi-Newton steps per level (count); last_steps: on the last level.
-        growths: steps of expectation-maximisation before each level (count).
+        steps: quasi-Newton steps of a round (count).
+        growths: steps of expectation-maximisation before them (count).
+        last_rounds: rounds of growth and descent on the fine level; the others have one (count).
+        settled: fall of the value per frame over a round at which the fine level has converged (nats).
         modes: deformation modes at most (count).
         fill_rank: rank of the completion from which incomplete tracks take their starts.
         noise_share: share of the spectrum from whose small end the noise is read where no covariance is given.
@@ -59,8 +61,9 @@ class MarginalParams:
     starts: int = 1
     gram_bases: tuple[int, ...] = (2, 3)
     steps: int = 15
-    last_steps: int = 100
     growths: int = 2
+    last_rounds: int = 8
+    settled: float = 0.05
     modes: int = 40
     fill_rank: int = 9
     noise_share: float = 0.25
@@ -136,11 +139,17 @@ def solve_marginal(
         views = _views(data, stack, params.noise_share)
         fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
         eps, level, before = params.coarse, 0, -1
+        value = torch.full_like(model.scale[:, 0], torch.inf)
         while True:
-            for _ in range(params.growths):
-                model = grow_loadings(views, model, eps, params.modes)
-            steps = params.last_steps if level == params.levels - 1 else params.steps
-            model, value, converged = descend(views, model, eps, steps, params.descent)
+            # What the loadings avoid follows the mean shape only in a growth, so the last level grows again and again.
+            for turn in range(params.last_rounds if level == params.levels - 1 else 1):
+                for _ in range(params.growths):
+                    model = grow_loadings(views, model, eps, params.modes)
+                last = value
+                model, value, converged = descend(views, model, eps, params.steps, params.descent)
+                if turn and float((last - value).amax()) < params.settled * len(data.xy):
+                    converged = True
+                    break
             if level == params.trial_levels - 1:
                 model = model.pick(int(value.argmin()))
             # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly.
