@@ -199,7 +199,7 @@ def solve_consensus(
         points3d, [views, views * (xy.new_tensor([1, 1, -1])[:, None] * xy.new_tensor([1, 1, -1]))]
     )
     turn = float(turn_of_view(rotations))
-    status = check_size(item, 1)
+    status = check_size(item, rank)
     if status is None and (turn < STATIC_TURN or looks_static(centred)):
         status = Status(
             "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"

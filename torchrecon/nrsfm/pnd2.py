@@ -303,16 +303,9 @@ def rigid_start(
 def first_views(
     filled: Float[Tensor, "frames points 2"], params: UpgradeParams, keep: int, generator: torch.Generator
 ) -> list[Float[Tensor, "frames 3 3"]]:
-    """Views of the metric upgrade, lowest residual first.
-
-    Only those K are tried whose 3K columns stand above rounding: noise-free tracks of degenerate shapes have fewer,
-    and the rest would fit the metric constraints with noise.
-    """
+    """Views of the metric upgrade, lowest residual first."""
     stack = (filled - filled.mean(1, keepdim=True)).mT.flatten(0, 1)
-    singular = torch.linalg.svdvals(stack)
-    available = int((singular > 1e-6 * singular[0]).sum())
-    ranks = tuple(k for k in params.ranks if k == min(params.ranks) or 3 * k <= available)
-    starts = sorted(upgraded_rotations(stack, replace(params, ranks=ranks), generator), key=lambda start: start[0])
+    starts = sorted(upgraded_rotations(stack, params, generator), key=lambda start: start[0])
     return [views for _, _, views in starts[:keep]]
 
 
@@ -334,7 +327,7 @@ def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2
     flip[2] = mirror_sign(points3d)
     points3d, rotations = points3d * flip, model.rotations * (flip[:, None] * flip)
     turn = float(turn_of_view(rotations))
-    status = check_size(item, 1)
+    status = check_size(item, rank)
     if status is None and (turn < STATIC_TURN or looks_static(filled - filled.mean(1, keepdim=True))):
         status = Status(
             "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"

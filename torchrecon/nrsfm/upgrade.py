@@ -92,7 +92,7 @@ def upgraded_rotations(
     frames, points = stack.shape[0] // 2, stack.shape[1]
     values = torch.linalg.svdvals(stack)
     # Columns of rounding noise fit the conditions as well as anything; a rigid body is tried all the same.
-    available = max(min(3, len(values)), int((values > 1e-9 * values[0]).sum()))
+    available = max(min(3, len(values)), int((values > 1e-6 * values[0]).sum()))
     found: list[tuple[float, int, Tensor]] = []
     seed: Tensor | None = None
     for rank in params.ranks:
