@@ -40,9 +40,12 @@ def filled(
         return data.xy, data.xy.mean(1)
     frames, points = data.visible.shape
     model = start_factors(data.xy, data.visible)
+    first = model.noise
     for rank in range(3, min(columns, points - 1, 2 * frames - 1) + 1, 3):
         grown = grow_factors(model, data.xy, data.visible, rank - model.rows.shape[-1])
         model = fit_factors(grown, data.xy, data.visible, iterations)
+        if model.noise <= 1e-8 * first:  # exact: nothing is left to fit
+            break
     xy = torch.where(data.visible[..., None], data.xy, model.predict())
     return xy, xy.mean(1)
 
@@ -69,6 +72,7 @@ def conclude(
     rank: int,
     complaint: str | None,
     summary: str,
+    covariance3d: Float[Tensor, "frames points 3 3"] | None = None,
 ) -> Reconstruction:
     """Apply the mirror rule and say what the data leave open.
 
@@ -79,7 +83,8 @@ def conclude(
     """
     flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
     flip[2] = mirror_sign(points3d)
-    points3d, rotations = points3d * flip, rotations * (flip[:, None] * flip)
+    both = flip[:, None] * flip
+    points3d, rotations = points3d * flip, rotations * both
     turn = float(turn_of_view(rotations))
     complete = bool(data.visible.all())
     status = check_size(data.tracks, rank)
@@ -98,4 +103,5 @@ def conclude(
         status = Status("not_converged", complaint)
     if status is None:
         status = Status("ok", f"{summary}, view turning by {turn:.0f} degrees")
-    return data.reconstruction(points3d, rotations, scale, translation, rank=rank, status=status)
+    spread = None if covariance3d is None else covariance3d * both
+    return data.reconstruction(points3d, rotations, scale, translation, rank=rank, status=status, covariance3d=spread)

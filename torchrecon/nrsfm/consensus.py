@@ -22,13 +22,12 @@ from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import nearest_rotation
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.common import STATIC_TURN, filled
 from torchrecon.nrsfm.observations import observe
-from torchrecon.nrsfm.pnd2 import Pnd2Params, filled_tracks, first_views, fit_procrustean, rigid_start
+from torchrecon.nrsfm.pnd2 import Pnd2Params, first_views, fit_procrustean, rigid_start
 from torchrecon.nrsfm.upgrade import UpgradeParams
 
 __all__ = ["ConsensusParams", "agree_on_depth", "agree_on_sign", "consensus", "draw_groups"]
-
-STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
 
 
 @dataclass(frozen=True)
@@ -166,15 +165,15 @@ def solve_consensus(
     data = observe(item)
     kind = data.xy.dtype
     data = replace(data, xy=data.xy.double())
-    filled = filled_tracks(data)
-    centred = filled - filled.mean(1, keepdim=True)
-    starts = first_views(filled, params.upgrade, params.keep, generator)
-    index = draw_groups(filled, params.size, params.uses, generator)
+    complete, _ = filled(data, 6)
+    centred = complete - complete.mean(1, keepdim=True)
+    starts = first_views(complete, params.upgrade, params.keep, generator)
+    index = draw_groups(complete, params.size, params.uses, generator)
     xy = data.xy[:, index].transpose(0, 1)
     visible = data.visible[:, index].transpose(0, 1)
     shapes, costs = [], []
     for views in starts:
-        begin = rigid_start(filled[:, index].transpose(0, 1), views.expand(len(index), *views.shape))
+        begin = rigid_start(complete[:, index].transpose(0, 1), views.expand(len(index), *views.shape))
         model, expected, cost, _ = fit_procrustean(xy, visible, begin, params.iterations, params.weak, anneal=True)
         plane = expected[..., :2] + model.translation[..., None, :]
         shapes.append(torch.cat([plane, expected[..., 2:]], -1))

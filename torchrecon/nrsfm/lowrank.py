@@ -8,15 +8,14 @@ import torch
 
 from torchrecon._typing import Int, Tensor
 from torchrecon.errors import ReconError
-from torchrecon.measurement import Reconstruction, Status, Tracks
-from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.measurement import Reconstruction, Tracks
+from torchrecon.nrsfm.base import solve_items
+from torchrecon.nrsfm.common import conclude
 from torchrecon.nrsfm.logdet import LogDetParams, camera_points, lift_depths, rigid_depths
 from torchrecon.nrsfm.observations import observe
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["LowRankParams", "logdet", "solve_complete"]
-
-STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
 
 
 @dataclass(frozen=True)
@@ -64,23 +63,18 @@ def solve_complete(
         xy, best[0], best[1], params.long_iterations, params.descent, anneal=False
     )
     points3d = camera_points(xy, depth) * unit
-    flip = torch.ones(3, dtype=xy.dtype, device=xy.device)
-    flip[2] = mirror_sign(points3d)
-    points3d, rotations = points3d * flip, rotations * (flip[:, None] * flip)
-    turn = float(turn_of_view(rotations))
-    status = check_size(item, rank)
-    if status is None and (turn < STATIC_TURN or looks_static(xy)):
-        status = Status(
-            "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
-        )
-    if status is None and not converged:
-        status = Status(
-            "not_converged", f"the cost still fell after {params.long_iterations} steps from the best start"
-        )
-    if status is None:
-        status = Status("ok", f"best of {len(tried)} starts, view turning by {turn:.0f} degrees")
-    scale = torch.ones_like(translation[:, 0])
-    return data.reconstruction(points3d, rotations, scale, translation, rank=rank, status=status).to(dtype=dtype)
+    complaint = None if converged else f"the cost still fell after {params.long_iterations} steps from the best start"
+    found = conclude(
+        data,
+        points3d,
+        rotations,
+        torch.ones_like(translation[:, 0]),
+        translation,
+        rank=rank,
+        complaint=complaint,
+        summary=f"best of {len(tried)} starts",
+    )
+    return found.to(dtype=dtype)
 
 
 def logdet(

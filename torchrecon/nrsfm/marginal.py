@@ -14,19 +14,17 @@ from dataclasses import dataclass, field
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
-from torchrecon.linalg.missing_factors import fit_factors, grow_factors, start_factors
 from torchrecon.linalg.noise_edge import marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
-from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.base import check_size, solve_items
+from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
-from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
-
-STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
 
 
 @dataclass(frozen=True)
@@ -80,18 +78,6 @@ def _noise_variance(stack: Float[Tensor, "rows points"], share: float) -> float:
     return float(eigenvalues[-count:].mean()) / marchenko_pastur_tail(d / n, share)
 
 
-def _filled(data: Observations, rank: int) -> Tensor:
-    """Every entry with a value for the starts: low-rank completion where entries are missing; never a measurement."""
-    if bool(data.visible.all()):
-        return data.xy
-    model = start_factors(data.xy, data.visible)
-    first = model.noise
-    # Nothing is left to fit once a fit is exact.
-    while model.rows.shape[-1] < rank and model.noise > 1e-8 * first:
-        model = fit_factors(grow_factors(model, data.xy, data.visible, 3), data.xy, data.visible)
-    return torch.where(data.visible[..., None], data.xy, model.predict())
-
-
 def _views(data: Observations, stack: Tensor, share: float) -> Views:
     """Observations with their covariance, or one common variance read off the end of the spectrum."""
     eye = torch.eye(2, dtype=data.xy.dtype, device=data.xy.device)
@@ -128,14 +114,13 @@ def solve_marginal(
         small = check_size(item, 1) or _shapeless(data)
         if small is not None:
             return _flat(data, rank, small).to(dtype=dtype)
-        filled = _filled(data, params.fill_rank)
-        centred = filled - filled.mean(1, keepdim=True)
-        stack = centred.mT.flatten(0, 1)
+        complete, centre = filled(data, params.fill_rank)
+        stack = (complete - centre[:, None]).mT.flatten(0, 1)
         found = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
         starts = [start[2] for start in found[: params.starts]]
         starts += [gram_upgrade(stack, 3 * bases, scaled=False).rotations for bases in params.gram_bases]
         rotations = torch.stack(starts)
-        model = _rigid_model(filled, rotations)
+        model = _rigid_model(complete, rotations)
         views = _views(data, stack, params.noise_share)
         fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
         eps, level, before = params.coarse, 0, -1
@@ -158,39 +143,35 @@ def solve_marginal(
                 break
             eps, level, before = eps * fall, level + 1, modes
         answer = evaluate(views, model, eps, with_spread=True)
-        status = _status(data, rank, model.rotations[0], converged, len(rotations))
-        return _reconstruction(data, views, model, answer, eps, rank, status).to(dtype=dtype)
+        assert answer.spread is not None
+        complaint = None if converged else "the likelihood still rose when the rounds of growth and descent were over"
+        # What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in
+        # pixels of the tracks in every frame.
+        answered = conclude(
+            data,
+            answer.points[0],
+            model.rotations[0],
+            torch.ones_like(model.scale[0]),
+            answer.translation[0],
+            rank=rank,
+            complaint=complaint,
+            summary=f"likeliest of {len(rotations)} starts, {model.loadings.shape[-1]} modes",
+            covariance3d=_covariance(views, model, answer.spread[0], eps),
+        )
+        return answered.to(dtype=dtype)
 
 
-def _reconstruction(
-    data: Observations, views: Views, model: ShapeModel, answer: Evaluation, eps: float, rank: int, status: Status
-) -> Reconstruction:
-    """The posterior mean of the shapes as seen, in the container's units.
+def _covariance(views: Views, model: ShapeModel, spread: Tensor, eps: float) -> Float[Tensor, "frames points 3 3"]:
+    """Of the points under the poses and the family that were found; camera axes.
 
-    What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in pixels of
-    the tracks in every frame.
+    Weights and translation leave the spread; the residual leaves what the image does not measure of it.
     """
-    assert answer.spread is not None
-    points3d, rotations = answer.points[0], model.rotations[0]
-    # Weights and translation leave the spread; the residual leaves what the image does not measure of it.
     variance = (eps * model.scale[0]).square()
     whitener = views.whitener(variance)
     measured = variance[:, None, None, None] * (whitener.mT @ whitener)
-    eye = torch.eye(3, dtype=points3d.dtype, device=points3d.device)
+    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
     residual = variance[:, None, None, None] * (eye - torch.nn.functional.pad(measured, (0, 1, 0, 1)))
-    covariance = answer.spread[0] @ answer.spread[0].mT + residual
-    flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
-    flip[2] = mirror_sign(points3d)
-    both = flip[:, None] * flip
-    return data.reconstruction(
-        points3d * flip,
-        rotations * both,
-        torch.ones_like(model.scale[0]),
-        answer.translation[0],
-        rank=rank,
-        status=status,
-        covariance3d=covariance * both,
-    )
+    return spread @ spread.mT + residual
 
 
 def _shapeless(data: Observations) -> Status | None:
@@ -209,22 +190,6 @@ def _flat(data: Observations, rank: int, status: Status) -> Reconstruction:
     points3d = torch.cat([xy - translation[:, None], torch.zeros_like(xy[..., :1])], -1)
     eye = torch.eye(3, dtype=xy.dtype, device=xy.device).expand(len(xy), 3, 3)
     return data.reconstruction(points3d, eye, torch.ones_like(xy[:, 0, 0]), translation, rank=rank, status=status)
-
-
-def _status(data: Observations, rank: int, rotations: Tensor, converged: bool, tried: int) -> Status:
-    """What the answer is worth, in words."""
-    turn = float(turn_of_view(rotations))
-    small = check_size(data.tracks, rank)
-    if small is not None:
-        return small
-    complete = bool(data.visible.all())
-    if turn < STATIC_TURN or (complete and looks_static(data.xy - data.xy.mean(1, keepdim=True))):
-        return Status(
-            "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
-        )
-    if not converged:
-        return Status("not_converged", f"the likelihood still rose after the last step from the best of {tried} starts")
-    return Status("ok", f"likeliest of {tried} starts, view turning by {turn:.0f} degrees")
 
 
 def marginal(

@@ -21,16 +21,15 @@ import torch
 
 from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.linalg import rotation_from_vector
-from torchrecon.linalg.missing_factors import fit_factors, grow_factors, start_factors
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
-from torchrecon.nrsfm.observations import Observations, observe
+from torchrecon.nrsfm.common import STATIC_TURN, filled
+from torchrecon.nrsfm.observations import observe
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = [
     "Pnd2Params",
     "ProcrusteanNormal",
-    "filled_tracks",
     "first_views",
     "fit_procrustean",
     "pnd2",
@@ -39,7 +38,7 @@ __all__ = [
     "solve_pnd2",
 ]
 
-STATIC_TURN = 3.0  # degrees of change of view below which depth is called undetermined
+
 OVERSHOOT = 1.0  # nats per frame by which a step may raise the cost: directions come and go as eps falls
 LONGEST_TURN = 0.3  # radians that one scoring step may turn a view: beyond it the linearisation says nothing
 
@@ -277,16 +276,6 @@ def fit_procrustean(
     return good, expected, cost, converged
 
 
-def filled_tracks(data: Observations) -> Float[Tensor, "frames points 2"]:
-    """Every entry with a value, for the starts alone: a low-rank fit to what was seen."""
-    if bool(data.visible.all()):
-        return data.xy
-    model = start_factors(data.xy, data.visible)
-    for _ in range(2):
-        model = fit_factors(grow_factors(model, data.xy, data.visible, 3), data.xy, data.visible)
-    return torch.where(data.visible[..., None], data.xy, model.predict())
-
-
 def rigid_start(
     xy: Float[Tensor, "*batch frames points 2"], rotations: Float[Tensor, "*batch frames 3 3"]
 ) -> ProcrusteanNormal:
@@ -301,10 +290,10 @@ def rigid_start(
 
 
 def first_views(
-    filled: Float[Tensor, "frames points 2"], params: UpgradeParams, keep: int, generator: torch.Generator
+    xy: Float[Tensor, "frames points 2"], params: UpgradeParams, keep: int, generator: torch.Generator
 ) -> list[Float[Tensor, "frames 3 3"]]:
-    """Views of the metric upgrade, lowest residual first."""
-    stack = (filled - filled.mean(1, keepdim=True)).mT.flatten(0, 1)
+    """Views of the metric upgrade of complete tracks, lowest residual first."""
+    stack = (xy - xy.mean(1, keepdim=True)).mT.flatten(0, 1)
     starts = sorted(upgraded_rotations(stack, params, generator), key=lambda start: start[0])
     return [views for _, _, views in starts[:keep]]
 
@@ -316,10 +305,10 @@ def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2
     kind = data.xy.dtype
     data = replace(data, xy=data.xy.double())
     xy, visible = data.xy, data.visible
-    filled = filled_tracks(data)
+    complete, _ = filled(data, 6)
     tried = [
-        fit_procrustean(xy, visible, rigid_start(filled, views), params.short_iterations, params, anneal=True)
-        for views in first_views(filled, params.upgrade, params.keep, generator)
+        fit_procrustean(xy, visible, rigid_start(complete, views), params.short_iterations, params, anneal=True)
+        for views in first_views(complete, params.upgrade, params.keep, generator)
     ]
     best = min(tried, key=lambda answer: float(answer[2]))
     model, points3d, _, converged = fit_procrustean(xy, visible, best[0], params.long_iterations, params, anneal=False)
@@ -328,7 +317,7 @@ def solve_pnd2(item: Tracks, rank: int, generator: torch.Generator, params: Pnd2
     points3d, rotations = points3d * flip, model.rotations * (flip[:, None] * flip)
     turn = float(turn_of_view(rotations))
     status = check_size(item, rank)
-    if status is None and (turn < STATIC_TURN or looks_static(filled - filled.mean(1, keepdim=True))):
+    if status is None and (turn < STATIC_TURN or looks_static(complete - complete.mean(1, keepdim=True))):
         status = Status(
             "undetermined", "the tracks look as from a view that never changes; they do not determine the depth"
         )
