@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
+from torchrecon.linalg import skew
 from torchrecon.linalg.noise_edge import marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, solve_items
@@ -21,7 +22,7 @@ from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
-from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
@@ -156,22 +157,29 @@ def solve_marginal(
             rank=rank,
             complaint=complaint,
             summary=f"likeliest of {len(rotations)} starts, {model.loadings.shape[-1]} modes",
-            covariance3d=_covariance(views, model, answer.spread[0], eps),
+            covariance3d=_covariance(views, model, answer, answer.spread[0], eps),
         )
         return answered.to(dtype=dtype)
 
 
-def _covariance(views: Views, model: ShapeModel, spread: Tensor, eps: float) -> Float[Tensor, "frames points 3 3"]:
-    """Of the points under the poses and the family that were found; camera axes.
+def _covariance(
+    views: Views, model: ShapeModel, answer: Evaluation, spread: Tensor, eps: float
+) -> Float[Tensor, "frames points 3 3"]:
+    """Of the points, camera axes: what weights, translation and poses leave, and the residual where it is not measured.
 
-    Weights and translation leave the spread; the residual leaves what the image does not measure of it.
+    The family of shapes is taken as known, and the weights do not follow the pose: an approximation.
     """
     variance = (eps * model.scale[0]).square()
     whitener = views.whitener(variance)
-    measured = variance[:, None, None, None] * (whitener.mT @ whitener)
+    gain = torch.nn.functional.pad(variance[:, None, None, None] * (whitener.mT @ whitener), (0, 1, 0, 1))
     eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
-    residual = variance[:, None, None, None] * (eye - torch.nn.functional.pad(measured, (0, 1, 0, 1)))
-    return spread @ spread.mT + residual
+    points, fisher = answer.points[0], answer.pose_fisher[0]
+    size = fisher.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
+    ridge = 1e-6 * size + 1e-6 * size.amax()
+    root = torch.linalg.cholesky(torch.linalg.inv(fisher + ridge * torch.eye(4, dtype=eye.dtype, device=eye.device)))
+    moves = torch.cat([-skew(points), points[..., None]], -1) @ root[:, None]
+    both = torch.cat([spread, (eye - gain) @ moves], -1)
+    return both @ both.mT + variance[:, None, None, None] * (eye - gain)
 
 
 def _shapeless(data: Observations) -> Status | None:
