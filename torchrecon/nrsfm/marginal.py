@@ -123,6 +123,8 @@ def solve_marginal(
         rotations = torch.stack(starts)
         model = _rigid_model(complete, rotations)
         views = _views(data, stack, params.noise_share)
+        noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+        noise = noise if noise > params.fine**2 else 0.0  # below the last residual it is a part of that
         fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
         eps, level, before = params.coarse, 0, -1
         value = torch.full_like(model.scale[:, 0], torch.inf)
@@ -130,7 +132,7 @@ def solve_marginal(
             # What the loadings avoid follows the mean shape only in a growth, so the last level grows again and again.
             for turn in range(params.last_rounds if level == params.levels - 1 else 1):
                 for _ in range(params.growths):
-                    model = grow_loadings(views, model, eps, params.modes)
+                    model = grow_loadings(views, model, eps, params.modes, noise)
                 last = value
                 model, value, converged = descend(views, model, eps, params.steps, params.descent)
                 if turn and float((last - value).amax()) < params.settled * len(data.xy):
