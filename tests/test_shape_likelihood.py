@@ -132,6 +132,19 @@ def test_growth_raises_the_likelihood_and_descent_finds_the_shapes():
     assert float((points - points.mean(1, keepdim=True) - truth).norm() / truth.norm()) < 0.02
 
 
+def test_noise_on_a_rigid_body_makes_no_modes():
+    g = torch.Generator().manual_seed(3)
+    turn = rotation_from_vector(torch.linspace(0, 3, 60)[:, None] * torch.tensor([0.2, 1.0, 0.1]))[None]
+    mean = torch.randn(1, 20, 3, generator=g)
+    mean = mean - mean.mean(-2, keepdim=True)
+    sigma, eps = 0.1, 0.02
+    xy = (mean @ turn.mT)[..., :2] + sigma * torch.randn(1, 60, 20, 2, generator=g)
+    noise = (sigma**2 * torch.eye(2)).expand(1, 60, 20, 2, 2)
+    views = Views(xy, torch.ones(1, 60, 20, dtype=torch.bool), noise)
+    rigid = ShapeModel(turn, torch.ones(1, 60), mean, torch.zeros(1, 20, 3, 0), torch.linalg.qr(tangents(mean))[0])
+    assert grow_loadings(views, rigid, eps, 10, sigma**2).loadings.shape[-1] == 0
+
+
 @pytest.mark.parametrize("item", [0, 1])
 def test_descent_of_a_batch_is_that_of_its_items(item):
     views, model = _problem()
