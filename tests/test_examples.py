@@ -18,7 +18,6 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 @pytest.fixture(autouse=True)
 def _as_a_user():
     torch.set_default_dtype(torch.float32)
-    yield
 
 
 def load(name: str) -> ModuleType:
