@@ -31,6 +31,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from torch import Tensor
@@ -42,6 +43,7 @@ import torchrecon
 from torchrecon.data.mocap import MocapClip, load_mocap
 from torchrecon.data.synthetic import ACTIONS
 from torchrecon.errors import ReconError
+from torchrecon.measurement._store import write_atomic
 from torchrecon.models.recogniser import ReadOut, Recogniser, classify_windows, save_recogniser
 from train.films import (
     AS_TRACKED,
@@ -197,6 +199,15 @@ class Training(L.LightningModule):
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints that are whole or absent: Lightning's go through the system's folder for temporary files, and from
+    another file system a move is a copy, which a kill can cut short."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, partial(torch.save, checkpoint))
+
+
 class Command(LightningCLI):
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         parser.add_argument("--out", type=str | None, default=None, help="weights file (.safetensors)")
@@ -251,7 +262,7 @@ def main(arguments: list[str] | None = None) -> int:
         save_config_callback=None,
         args=_plain(sys.argv[1:] if arguments is None else arguments),
         parser_kwargs={"default_config_files": [str(CONFIG)]},
-        trainer_defaults={"logger": False, "deterministic": True},
+        trainer_defaults={"logger": False, "deterministic": True, "plugins": [WholeCheckpoints()]},
     )
     settings = _settings(command)
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
@@ -260,15 +271,19 @@ def main(arguments: list[str] | None = None) -> int:
         command.config.out or f"runs/recogniser/recogniser{'_2d' if params.views == ('camera',) else ''}.safetensors"
     )
     out.parent.mkdir(parents=True, exist_ok=True)
+    half_way = out.with_suffix(f".{digest[:12]}")
+    for leftover in out.parent.glob(f".{out.name}.*"):  # of a run that was killed as it wrote
+        shutil.rmtree(leftover)
     if not command.config.force and _made_by(out) == digest:
+        shutil.rmtree(half_way, ignore_errors=True)
         print(f"{out} is already there, made with these settings (--force makes it again)")
         return 0
 
-    half_way = out.with_suffix(f".{digest[:12]}")
     callbacks = [item for item in command.trainer.callbacks if not isinstance(item, ModelCheckpoint)]
     command.trainer.callbacks = [*callbacks, ModelCheckpoint(half_way, save_last=True)]
     last = half_way / "last.ckpt"
-    command.trainer.fit(command.model, command.datamodule, ckpt_path=last if last.exists() else None)
+    resume = last if last.exists() else None
+    command.trainer.fit(command.model, command.datamodule, ckpt_path=resume, weights_only=True)
     recogniser = command.model.trained()
 
     report: dict[str, Any] = {"settings": settings, "settings_hash": digest, **_origin()}
