@@ -320,10 +320,14 @@ class Draws(Sampler[tuple[int, int]]):
     def __init__(self, films: list[Film]) -> None:
         labels = torch.tensor([film.label for film in films])
         self.odds = 1.0 / torch.bincount(labels)[labels]
-        self.epoch = 0
+        self.epoch = self.first = 0
+
+    def begin(self, epoch: int) -> None:
+        """Draw no epoch before this one: the trainer of a resumed run asks for films before it sets the epoch."""
+        self.epoch = self.first = epoch
 
     def set_epoch(self, epoch: int) -> None:
-        self.epoch = epoch
+        self.epoch = max(epoch, self.first)
 
     def __len__(self) -> int:
         return len(self.odds)

@@ -102,6 +102,7 @@ class Films(L.LightningDataModule):
         self.windows, self.batch_size, self.workers = windows, batch_size, workers
         self.classes = ACTIONS if file is None else MOCAP_CLASSES
         self.training: list[Film] = []
+        self.done = 0  # epochs that a resumed run has behind it
 
     def setup(self, stage: str) -> None:
         if not self.training:
@@ -137,13 +138,15 @@ class Films(L.LightningDataModule):
         recogniser = self.trainer.lightning_module.recogniser
         classes = recogniser.classes
         flat_label = classes.index(FLAT_CLASS) if FLAT_CLASS in classes else None
+        draws = Draws(self.training)
         windows = Windows(
             self.training, recogniser.params, self.augmentation, self.windows, self.train_seeds, flat_label
         )
+        draws.begin(self.done)
         return DataLoader(
             windows,
             batch_size=self.batch_size,
-            sampler=Draws(self.training),
+            sampler=draws,
             num_workers=self.workers,
             drop_last=len(self.training) > self.batch_size,
         )
@@ -181,8 +184,19 @@ class Training(L.LightningModule):
             self.recogniser.to_classes.bias[self.recogniser.classes.index(FLAT_CLASS)] += math.log(self.flat_prior)
         return self.recogniser.eval()
 
-    def on_train_epoch_start(self) -> None:
-        torch.manual_seed(self.current_epoch)  # dropout depends on the epoch, not on what was drawn before
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.trainer.datamodule.done = checkpoint["epoch"] + 1  # they are written at the end of an epoch
+
+    def on_train_batch_start(self, batch: Any, index: int) -> None:
+        """Dropout depends on the epoch, not on what was drawn before.
+
+        Not at the start of the epoch, after which a data loader may or may not be opened: that draws a number. From the
+        second epoch on an undisturbed run does so, and the draw here keeps the weights that it has always given.
+        """
+        if index == 0:
+            torch.manual_seed(self.current_epoch)
+            if self.current_epoch > 0:
+                torch.empty((), dtype=torch.int64).random_()
 
     def training_step(self, batch: tuple[Tensor, Tensor], index: int) -> Tensor:
         volume, label = (part.flatten(0, 1) for part in batch)
