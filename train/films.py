@@ -115,6 +115,17 @@ FLAT_CLASS = "flat"
 MOCAP_CLASSES = ("shoot", "run", "jump", "pass", "dribble", "walk")
 """Of real motion; dribble and walk are the distractors."""
 
+STAND_INS = {
+    "shoot": ("shoot",),
+    "run": ("run",),
+    "jump": ("jump", "hop"),
+    "pass": ("pass",),
+    "dribble": ("dribble",),
+    "walk": ("idle",),
+}
+"""What the synthetic world performs beside the clips of each class. Every class has something: one that had only
+captured motion would be recognised by the look of captured motion."""
+
 
 def synthetic_film(seed: int, points: int, turn: float | None = None) -> Film:
     """Film number ``seed`` of the synthetic world; the action is ``ACTIONS[seed % 6]``.
@@ -148,21 +159,36 @@ def film_of(body: Body, motion: Motion, label: int, points: int, turn: float | N
     return Film(xyz[:, ever].float(), seen[:, ever], camera.rotations.float(), thickness[ever].float(), label)
 
 
-def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Film:
+def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int, synthetic: float = 0.0) -> Film:
     """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 6]``.
 
-    A class without clips is performed by the synthetic world.
+    Args:
+        synthetic: odds that the synthetic world performs instead (``STAND_INS``). The clips are those of few people,
+            and who runs here is not who jumps there: without it the recogniser learns who moves rather than how. A
+            class without clips is always performed by the synthetic world.
     """
     g = torch.Generator().manual_seed(seed)
     label = seed % len(MOCAP_CLASSES)
-    of_class = clips[MOCAP_CLASSES[label]]
+    name = MOCAP_CLASSES[label]
+    of_class = clips[name]
     body = sample_body(g)
-    if of_class:
+    if not of_class or float(torch.rand((), generator=g)) < synthetic:
+        styles = STAND_INS[name]
+        style = styles[int(torch.randint(len(styles), (), generator=g))]
+        motion = sample_motion(style, body, generator=g)
+    else:
         clip = of_class[seed // len(MOCAP_CLASSES) % len(of_class)]
         motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
-    else:
-        motion = sample_motion(MOCAP_CLASSES[label], body, generator=g)
     return film_of(body, motion, label, points, None, g)
+
+
+def held_out_film(seed: int, clips: list[MocapClip], points: int, turn: float) -> Film:
+    """Clip number ``seed % len(clips)`` on a random body before a camera that turns by ``turn`` degrees."""
+    g = torch.Generator().manual_seed(seed)
+    clip = clips[seed % len(clips)]
+    body = sample_body(g)
+    motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
+    return film_of(body, motion, MOCAP_CLASSES.index(clip.label), points, turn, g)
 
 
 def make_films(make: Callable[[int], Film], seeds: range, workers: int) -> Iterator[Film]:

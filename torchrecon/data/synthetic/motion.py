@@ -12,6 +12,7 @@ from torchrecon.data.synthetic.actions_common import Performance
 from torchrecon.data.synthetic.body import Body
 from torchrecon.data.synthetic.distractors import dribble, idle
 from torchrecon.data.synthetic.gait import run
+from torchrecon.data.synthetic.hops import hop
 from torchrecon.data.synthetic.leaps import jump
 from torchrecon.data.synthetic.passes import pass_ball
 from torchrecon.data.synthetic.pose import solve_pose
@@ -32,6 +33,9 @@ _ACTORS: dict[str, Callable[[Body, Tensor, torch.Generator | None], Performance]
 }
 ACTIONS = tuple(_ACTORS)
 """Names of the actions; dribble and idle are there as distractors."""
+
+_MORE = {"hop": hop}
+"""What can be asked for by name besides: ways to move that only training films show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,7 @@ def sample_motion(
     torch's default dtype; the draws do not depend on it.
 
     Args:
-        action: one of ``ACTIONS``.
+        action: one of ``ACTIONS``, or ``hop``: jumps on the spot as outside of a game, to train on.
         frames: number of frames; 60 at 25 fps hold any action whole.
 
     Raises:
@@ -90,12 +94,13 @@ def sample_motion(
         >>> motion.joints.shape, bool(motion.ball.isnan().all())
         (torch.Size([30, 21, 3]), True)
     """
-    if action not in _ACTORS:
+    actors = _ACTORS | _MORE
+    if action not in actors:
         raise ReconError(f"action: {action!r} is not known; use one of {', '.join(ACTIONS)}")
     if frames < 2 or fps <= 0:
         raise ReconError(f"motion of {frames} frames at {fps} fps: at least 2 frames and a positive rate are needed")
     t = torch.arange(frames, dtype=torch.float64) / fps
-    played = _ACTORS[action](body, t, generator)
+    played = actors[action](body, t, generator)
     joints, bones = solve_pose(body, played.trunk, played.arms)
     contacts = played.trunk.stance.planted
     ball = torch.full((frames, 3), torch.nan, dtype=torch.float64) if played.ball is None else played.ball
