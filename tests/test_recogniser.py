@@ -261,12 +261,12 @@ def test_what_is_no_recogniser_is_refused(tmp_path):
         save_recogniser(Recogniser(("run",)), tmp_path / "none" / "a.safetensors")
 
 
-def test_a_distractor_without_clips_is_performed_by_the_synthetic_world(generator):
+def test_an_action_without_clips_is_performed_by_the_synthetic_world(generator):
     body = sample_body(generator)
     motion = sample_motion("run", body, frames=40, generator=generator)
     clip = MocapClip(motion.joints, motion.parents, motion.names, 30.0, "run")
-    clips = {name: [clip] for name in MOCAP_CLASSES if name != "dribble"} | {"dribble": []}
-    label = MOCAP_CLASSES.index("dribble")
+    clips = {name: [clip] for name in MOCAP_CLASSES if name != "jump"} | {"jump": []}
+    label = MOCAP_CLASSES.index("jump")
     made = mocap_film(label, clips, 60)
     assert made.label == label
     assert len(made.points3d) == 60  # the synthetic world's own length, not that of a clip

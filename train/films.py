@@ -112,17 +112,11 @@ are fitted to where the tracker holds points on films of training seeds."""
 FLAT_CLASS = "flat"
 """The distractor class of shapes without depth, the last of the recogniser of 3D shapes."""
 
-MOCAP_CLASSES = ("shoot", "run", "jump", "pass", "dribble", "walk")
-"""Of real motion; dribble and walk are the distractors."""
+MOCAP_CLASSES = ("shoot", "run", "jump", "pass")
+"""Of real motion, without distractors: where few people dribble and walk, such a class becomes one of how those people
+look, and the actions of others fall into it. Shapes without depth have a class of their own."""
 
-STAND_INS = {
-    "shoot": ("shoot",),
-    "run": ("run",),
-    "jump": ("jump", "hop"),
-    "pass": ("pass",),
-    "dribble": ("dribble",),
-    "walk": ("idle",),
-}
+STAND_INS = {"shoot": ("shoot",), "run": ("run",), "jump": ("jump", "hop"), "pass": ("pass",)}
 """What the synthetic world performs beside the clips of each class. Every class has something: one that had only
 captured motion would be recognised by the look of captured motion."""
 
@@ -160,7 +154,7 @@ def film_of(body: Body, motion: Motion, label: int, points: int, turn: float | N
 
 
 def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int, synthetic: float = 0.0) -> Film:
-    """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 6]``.
+    """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 4]``.
 
     Args:
         synthetic: odds that the synthetic world performs instead (``STAND_INS``). The clips are those of few people,

@@ -124,12 +124,12 @@ class Films(L.LightningDataModule):
             if clip.subject not in self.exclude and len(clip) >= self.shortest * clip.fps:
                 clips[clip.label].append(clip)
         empty = [name for name, of_class in clips.items() if not of_class]
-        if set(empty) - {"dribble"}:
+        if len(empty) == len(clips):
             raise ReconError(
                 f"{self.file}: no clip of {', '.join(empty)} of {self.shortest} s or more is left to train on"
             )
-        if empty:  # a distractor, not one of the actions that are scored
-            print(f"{self.file}: no clip of dribble is left to train on; synthetic ones stand in")
+        if empty:
+            print(f"{self.file}: no clip of {', '.join(empty)} is left to train on; synthetic ones stand in")
         return partial(mocap_film, clips=clips, points=self.points, synthetic=self.synthetic)
 
     def validation(self, turn: float, what: str) -> tuple[list[Film], list[str] | None]:
