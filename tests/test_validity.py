@@ -80,9 +80,10 @@ def test_excluded_subjects_are_validated_on_and_never_trained_on(generator, monk
     maker = data._maker()
     assert {clip.subject for of_class in maker.keywords["clips"].values() for clip in of_class} == {"a"}
     shown, sources = data.validation(300.0, "films")
-    assert [(MOCAP_CLASSES[film.label], source) for film, source in zip(shown, sources, strict=True)] == [
+    assert {(MOCAP_CLASSES[film.label], source) for film, source in zip(shown, sources, strict=True)} == {
         (name, f"source of b {name}") for name in ("shoot", "run", "pass")
-    ]
+    }
+    assert len(shown) == 3
 
 
 def test_every_class_has_synthetic_stand_ins(generator, monkeypatch):
@@ -92,12 +93,13 @@ def test_every_class_has_synthetic_stand_ins(generator, monkeypatch):
     monkeypatch.setattr(
         films, "sample_motion", lambda name, *a, **k: played.append(name) or sample_motion(name, *a, **k)
     )
+    monkeypatch.setattr(films, "film_of", lambda body, motion, label, *rest: label)  # nobody looks at it here
     for seed in range(4):
         mocap_film(seed, clips, 20, synthetic=0.0)
     assert played in (["jump"], ["hop"])  # of which there is no clip
     played.clear()
-    for seed in range(24):
-        assert mocap_film(seed, clips, 20, synthetic=1.0).label == seed % 4
+    for seed in range(16):
+        assert mocap_film(seed, clips, 20, synthetic=1.0) == seed % 4
     assert set(played) == {"shoot", "run", "jump", "hop", "pass"}
 
 
