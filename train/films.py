@@ -157,9 +157,9 @@ def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int, synthe
     """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 4]``.
 
     Args:
-        synthetic: odds that the synthetic world performs instead (``STAND_INS``). The clips are those of few people,
-            and who runs here is not who jumps there: without it the recogniser learns who moves rather than how. A
-            class without clips is always performed by the synthetic world.
+        synthetic: odds that the synthetic world performs instead (``STAND_INS``). It has jumps that the few who jump
+            here do not do, but nobody in it runs on the spot, which then is read as something else. A class without
+            clips is always performed by it.
     """
     g = torch.Generator().manual_seed(seed)
     label = seed % len(MOCAP_CLASSES)

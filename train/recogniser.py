@@ -86,7 +86,7 @@ class Films(L.LightningDataModule):
         augmentation: Augmentation,
         file: str | None = None,
         exclude: list[str] | None = None,
-        synthetic: float = 0.5,
+        synthetic: float = 0.0,
         shortest: float = 0.5,
         films: int = 720,
         points: int = 500,
