@@ -81,16 +81,16 @@ class Variation:
 
     tempo: tuple[float, float] = (0.7, 1.35)
     bones: float = 1.0
-    turn: float = 0.3
-    tilt: tuple[float, float] = (-0.15, 0.6)
+    turn: float = 0.25
+    tilt: tuple[float, float] = (-0.15, 0.5)
     roll: float = 0.06
-    distance: tuple[float, float] = (1.3, 7.0)
+    distance: tuple[float, float] = (1.5, 7.0)
     follow: float = 0.5
     whole: float = 0.25
     absent: float = 0.5
     lost: tuple[float, float] = (0.05, 0.1)
     gap: int = 14
-    noise: tuple[float, float] = (5e-4, 0.02)
+    noise: tuple[float, float] = (5e-4, 0.01)
 
 
 class Batch(NamedTuple):

@@ -77,7 +77,7 @@ class Motions(L.LightningDataModule):
         held_seeds: int = 2_000_000,
         held_out: float = 0.1,
         batch_size: int = 64,
-        steps: int = 900,
+        steps: int = 1200,
     ) -> None:
         super().__init__()
         self.variation, self.files, self.exclude = variation, files, exclude or []

@@ -110,12 +110,12 @@ class HumanPrior(nn.Module):
             covariance = covariance + torch.diag_embed(torch.stack([across, across, 0 * across], -1).square())
             covariance = turn.mT[:, None] @ (metres[..., None].square() * covariance) @ turn[:, None]
             translation = shape.mean(1)
-        home = {"device": tracks.xy.device, "dtype": tracks.xy.dtype}
+        device, dtype = tracks.xy.device, tracks.xy.dtype
         return ShapeBelief(
-            (shape - shape.mean(1, keepdim=True)).to(**home),
-            covariance.to(**home),
-            translation[:, : 2 if tracks.intrinsics is None else 3].to(**home),
-            torch.tensor([joint is not None for joint in where], device=tracks.xy.device),
+            (shape - shape.mean(1, keepdim=True)).to(device, dtype),
+            covariance.to(device, dtype),
+            translation[:, : 2 if tracks.intrinsics is None else 3].to(device, dtype),
+            torch.tensor([joint is not None for joint in where], device=device),
             self.source,
         )
 

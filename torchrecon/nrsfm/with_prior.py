@@ -63,15 +63,15 @@ def fuse(answer: Reconstruction, belief: ShapeBelief, tracks: Tracks) -> Reconst
         belief: of the prior, same points.
         tracks: what both have seen.
     """
-    assert isinstance(answer.status, Status)
-    if not answer.status.ok:
+    found = answer.statuses[0]
+    if not found.ok:
         return _belief_alone(answer, belief, tracks)
     prior = belief.points3d
     if tracks.intrinsics is None and _misfit(answer.mirrored().points3d, prior) < _misfit(answer.points3d, prior):
         answer = answer.mirrored()
     if answer.covariance3d is None:
-        said = Status("ok", f"{answer.status}; of the prior ({belief.source}) only the mirror is used")
-        return replace(answer, status=said)
+        text = f"{found.text}; of the prior ({belief.source}) only the mirror is used"
+        return replace(answer, status=Status("ok", text))
     scale = (answer.points3d * prior).sum() / prior.square().sum().clamp_min(torch.finfo(prior.dtype).tiny)
     eye = torch.eye(3, dtype=prior.dtype, device=prior.device)
     # The solver's covariance is singular along rays that are measured exactly; a trace of its size keeps it invertible.
@@ -85,7 +85,7 @@ def fuse(answer: Reconstruction, belief: ShapeBelief, tracks: Tracks) -> Reconst
     moved = (gain @ (scale * prior - answer.points3d)[..., None])[..., 0]
     points = answer.points3d + moved
     share = float(gain[..., belief.known, 2, 2].mean())
-    said = f"{answer.status.text}; the prior ({belief.source}) has {100 * share:.0f} % of the depth"
+    said = f"{found.text}; the prior ({belief.source}) has {100 * share:.0f} % of the depth"
     return Reconstruction.from_points(
         points,
         answer.rotations,
