@@ -80,6 +80,19 @@ def test_unseen_entries_are_never_read(prior, walker, generator):
     assert torch.isfinite(answers[0].points3d).all()
 
 
+def test_a_person_who_is_out_of_sight_for_a_while_stays_on_the_way(prior, walker):
+    xy = 200 * walker[:40, :, :2] + torch.arange(40.0)[:, None, None] * torch.tensor([9.0, 0.0]) + 500
+    gone = (torch.arange(40) >= 14) & (torch.arange(40) < 22)
+    for value in prior.network.leave.parameters():
+        value.data.zero_()  # what is seen stands where it is seen, what is not at the centre
+    belief = prior(tr.Tracks(xy, ~gone[:, None].expand(40, 21), names=JOINTS))
+    torch.testing.assert_close(belief.translation[~gone][:12], xy.mean(1)[:12], atol=1e-6, rtol=0)
+    assert float((belief.translation - xy.mean(1)).norm(dim=-1).max()) < 12.0  # of 500 pixels and more
+    lone = prior(tr.Tracks(xy[:1], names=JOINTS))
+    assert lone.points3d.shape == (1, 21, 3)
+    assert bool(torch.isfinite(lone.points3d).all())
+
+
 def test_answer_follows_place_and_size_of_the_image(prior, walker):
     xy = 200 * walker[..., :2]
     plain = prior(tr.Tracks(xy, names=JOINTS))

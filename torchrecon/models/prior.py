@@ -130,12 +130,13 @@ class HumanPrior(nn.Module):
         after = (before + 1).clamp_max(len(times) - 1)
         at = xy[before] + share[:, None, None] * (xy[after] - xy[before])
         there = (seen[before] | (share == 1)[:, None]) & (seen[after] | (share == 0)[:, None])
+        centre = _bridged(centre_and_size(at, there)[0], there.any(-1))
         starts = torch.arange(0, max(1, count - WINDOW + STRIDE), STRIDE, device=xy.device)
         frame = (starts[:, None] + torch.arange(WINDOW, device=xy.device)).clamp_max(count - 1)
         window, shown = at[frame], there[frame]
-        centre, size = centre_and_size(window, shown)
-        mean, deviation = self.network.both_sides((window - centre) / size, shown)
-        mean = mean * size + torch.nn.functional.pad(centre, (0, 1))
+        _, size = centre_and_size(window, shown)
+        mean, deviation = self.network.both_sides((window - centre[frame]) / size, shown)
+        mean = mean * size + torch.nn.functional.pad(centre[frame], (0, 1))
         deviation = deviation * size * self.widen
         weight = torch.arange(1, WINDOW + 1, device=xy.device)
         weight = torch.minimum(weight, weight.flip(0)).to(xy.dtype).expand(frame.shape)
@@ -160,6 +161,18 @@ def _between(times: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
     near = share.round()
     # Times that agree but for rounding are the same: an entry that is measured must not be taken for one between two.
     return before, torch.where((share - near).abs() < 1e-3, near, share)
+
+
+def _bridged(centre: Float[Tensor, "frames 1 2"], seen: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 1 2"]:
+    """Centres with those of frames that show nothing on a straight line between their neighbours."""
+    known = seen.nonzero()[:, 0]
+    if not len(known):
+        raise ReconError("tracks: no joint that the prior knows is seen in two frames in a row; nothing can be said")
+    frame = torch.arange(len(seen), device=seen.device)
+    before, share = _between(known.to(centre.dtype), frame.to(centre.dtype))
+    after = (before + 1).clamp_max(len(known) - 1)
+    start, end = centre[known[before]], centre[known[after]]
+    return start + share[:, None, None] * (end - start)
 
 
 def _towards(xy: Float[Tensor, "frames joints 2"], seen: Bool[Tensor, "frames joints"]) -> Float[Tensor, "frames 3 3"]:

@@ -52,11 +52,12 @@ def with_prior(solver: Solver, prior: ShapePrior) -> Solver:
 def fuse(answer: Reconstruction, belief: ShapeBelief, tracks: Tracks) -> Reconstruction:
     """Combine the solver's answer and the prior's belief for one sequence.
 
-    Without ``ok`` from the solver the belief is the answer. With it both are multiplied as Gaussians: the belief is
-    brought to the scale of the solver's answer and chooses the mirror where there are no intrinsics. A solver states
-    what its model leaves open, not whether its model holds; the prior's spread is that of real people. So where both
-    are farther apart in depth than the spreads allow, the solver's covariance is widened until they are not. The prior
-    is left out for points that it does not know, and but for the mirror where the solver states no covariance.
+    Without ``ok`` from the solver, and without measured depth, the belief is the answer. Else both are multiplied as
+    Gaussians: the belief is brought to the scale of the solver's answer and chooses the mirror where there are no
+    intrinsics. A solver states what its model leaves open, not whether its model holds; the prior's spread is that of
+    real people. So where both are farther apart in depth than the spreads allow, the solver's covariance is widened
+    until they are not. The prior is left out for points that it does not know, and but for the mirror where the solver
+    states no covariance.
 
     Args:
         answer: of any solver.
@@ -64,7 +65,7 @@ def fuse(answer: Reconstruction, belief: ShapeBelief, tracks: Tracks) -> Reconst
         tracks: what both have seen.
     """
     found = answer.statuses[0]
-    if not found.ok:
+    if not found.ok and tracks.depth is None:
         return _belief_alone(answer, belief, tracks)
     prior = belief.points3d
     if tracks.intrinsics is None and _misfit(answer.mirrored().points3d, prior) < _misfit(answer.points3d, prior):
