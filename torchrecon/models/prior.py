@@ -148,7 +148,10 @@ class HumanPrior(nn.Module):
             blended.append(sums.index_add(0, frame.flatten(), weighted) / total)
         before, share = _between(grid, times)
         after = (before + 1).clamp_max(count - 1)
-        mean, deviation = (v[before] + share[:, None, None] * (v[after] - v[before]) for v in blended)
+        mean, deviation, passed = (v[before] + share[:, None, None] * (v[after] - v[before]) for v in (*blended, at))
+        # What a measured entry does between two times of the grid is kept.
+        kept = seen & there[before] & there[after]
+        mean[..., :2] += torch.where(kept[..., None], xy - passed, xy.new_zeros(()))
         return mean, deviation
 
 
