@@ -57,11 +57,11 @@ def fuse(answer: Reconstruction, belief: ShapeBelief, tracks: Tracks) -> Reconst
 
     Without ``ok`` from the solver, and without measured depth, the belief is the answer. Else the belief is brought to
     the scale of the solver's answer and chooses the mirror where there are no intrinsics. A solver states what its
-    model leaves open, not whether its model holds; the prior's spread is that of real people. Where both are farther apart in
-    depth than :data:`CONTRADICTION` times what the spreads allow, people do not move as the solver says, and the belief
-    is the answer. Else both are multiplied as Gaussians, the solver's covariance widened, across the image and along
-    depth, until it explains how far apart they are. The prior is left out for points that it does not know, and but for
-    the mirror where the solver states no covariance.
+    model leaves open, not whether its model holds; the prior's spread is that of real people. Where both are farther
+    apart in depth than :data:`CONTRADICTION` times what the spreads allow, people do not move as the solver says, and
+    the belief is the answer. Else both are multiplied as Gaussians, the solver's covariance widened, across the image
+    and along depth, until it explains how far apart they are. The prior is left out for points that it does not know,
+    and but for the mirror where the solver states no covariance.
 
     Args:
         answer: of any solver.
