@@ -54,7 +54,7 @@ def reconstruct(
         raise ReconError("prior: no learned shape prior exists yet; leave prior=None")
     solve = get_solver(solver) if isinstance(solver, str) else solver
     if rank == "auto":
-        estimate = estimate_rank(tracks, generator=generator)
+        estimate = estimate_rank(tracks.detach(), generator=generator)
         answer = solve(tracks, estimate.rank, generator=generator)
         return replace(answer, deformation_degree=estimate.deformation_degree)
     if isinstance(rank, bool) or not isinstance(rank, int) or rank < 1:
