@@ -12,11 +12,12 @@ import math
 
 import torch
 
-from torchrecon._typing import Float, Tensor
+from torchrecon._typing import Bool, Float, Tensor
 
 __all__ = [
     "complement_basis",
     "count_signals",
+    "difference_noise",
     "kritchman_nadler_noise",
     "marchenko_pastur_tail",
     "spectrum",
@@ -131,6 +132,31 @@ def count_signals(
             thresholds.extend(thresholds[-1:] * (d - k - 1))
             break
     return count, eigenvalues.new_tensor(thresholds)
+
+
+def difference_noise(
+    xy: Float[Tensor, "*b frames points 2"], visible: Bool[Tensor, "*b frames points"]
+) -> Float[Tensor, "*b"]:
+    """Noise variance of evenly sampled smooth tracks from their third differences; what moves jerkily adds to it.
+
+    Only entries that are seen in four frames on end are read; infinite where there are none.
+
+    Example:
+        >>> import torch
+        >>> g = torch.Generator().manual_seed(0)
+        >>> smooth = torch.linspace(0, 6, 300, dtype=torch.float64)[:, None, None].sin().expand(300, 9, 2)
+        >>> noisy = smooth + 0.1 * torch.randn(300, 9, 2, generator=g, dtype=torch.float64)
+        >>> round(float(difference_noise(noisy, torch.ones(300, 9, dtype=torch.bool)) ** 0.5), 2)
+        0.1
+    """
+    if xy.shape[-3] < 4:
+        return torch.full_like(xy[..., 0, 0, 0], torch.inf)
+    xy = torch.where(visible[..., None], xy, xy.new_zeros(()))
+    third = xy.diff(n=3, dim=-3)
+    whole = visible.unfold(-2, 4, 1).all(-1)[..., None]
+    total = torch.where(whole, third.square(), xy.new_zeros(())).sum((-1, -2, -3))
+    # 20 = 1 + 9 + 9 + 1
+    return torch.where(whole.sum((-1, -2, -3)) > 0, total / (40 * whole.sum((-1, -2, -3)).clamp_min(1)), torch.inf)
 
 
 def marchenko_pastur_tail(ratio: float, share: float) -> float:

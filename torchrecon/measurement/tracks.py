@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -254,11 +254,18 @@ class Tracks:
         def move(tensor: Tensor) -> Tensor:
             return tensor.to(device=device, dtype=dtype if tensor.is_floating_point() else None)
 
-        moved: dict[str, Any] = {"xy": move(self.xy), "visible": self.visible.to(device=device)}
-        moved |= {name: move(value) for name in _TENSORS if (value := getattr(self, name)) is not None}
+        return self._mapped(move)
+
+    def detach(self) -> Tracks:
+        """The same tracks without the graph that leads to them."""
+        return self._mapped(Tensor.detach)
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Tracks:
+        changed: dict[str, Any] = {"xy": change(self.xy), "visible": change(self.visible)}
+        changed |= {name: change(value) for name in _TENSORS if (value := getattr(self, name)) is not None}
         if self.extras is not None:
-            moved["extras"] = {name: move(value) for name, value in self.extras.items()}
-        return replace(self, **moved)
+            changed["extras"] = {name: change(value) for name, value in self.extras.items()}
+        return replace(self, **changed)
 
     def select(
         self, frames: Sequence[int] | slice | Tensor | None = None, points: Sequence[int] | slice | Tensor | None = None

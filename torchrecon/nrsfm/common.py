@@ -39,11 +39,12 @@ def filled(
     if bool(data.visible.all()):
         return data.xy, data.xy.mean(1)
     frames, points = data.visible.shape
-    model = start_factors(data.xy, data.visible)
+    known = data.xy.detach()
+    model = start_factors(known, data.visible)
     first = model.noise
     for rank in range(3, min(columns, points - 1, 2 * frames - 1) + 1, 3):
-        grown = grow_factors(model, data.xy, data.visible, rank - model.rows.shape[-1])
-        model = fit_factors(grown, data.xy, data.visible, iterations)
+        grown = grow_factors(model, known, data.visible, rank - model.rows.shape[-1])
+        model = fit_factors(grown, known, data.visible, iterations)
         if model.noise <= 1e-8 * first:  # exact: nothing is left to fit
             break
     xy = torch.where(data.visible[..., None], data.xy, model.predict())
@@ -82,10 +83,10 @@ def conclude(
         summary: text of the status ``ok``; the turn of the view is added.
     """
     flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
-    flip[2] = mirror_sign(points3d)
+    flip[2] = mirror_sign(points3d.detach())
     both = flip[:, None] * flip
     points3d, rotations = points3d * flip, rotations * both
-    turn = float(turn_of_view(rotations))
+    turn = float(turn_of_view(rotations.detach()))
     complete = bool(data.visible.all())
     status = check_size(data.tracks, rank)
     if status is None and (turn < STATIC_TURN or (complete and looks_static(data.xy - data.xy.mean(1, keepdim=True)))):

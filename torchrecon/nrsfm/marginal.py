@@ -15,14 +15,16 @@ import torch
 
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import skew
-from torchrecon.linalg.noise_edge import marchenko_pastur_tail
+from torchrecon.linalg.noise_edge import difference_noise, marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, solve_items
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
+from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
@@ -35,6 +37,7 @@ class MarginalParams:
     Attributes:
         upgrade: of the metric upgrade, which supplies the starts.
         descent: of the quasi-Newton descent.
+        smoothing: of noisy tracks over time, before anything else.
         coarse, fine: first and last standard deviation of the residual.
         finest: how far below ``fine`` the residual goes on falling while no new mode appears.
         levels: number of residual levels, geometric from coarse to fine (count).
@@ -48,10 +51,12 @@ class MarginalParams:
         modes: deformation modes at most (count).
         fill_rank: rank of the completion from which incomplete tracks take their starts.
         noise_share: share of the spectrum from whose small end the noise is read where no covariance is given.
+        noise_agrees: factor on that variance up to which what third differences say is believed instead (no unit).
     """
 
     upgrade: UpgradeParams = field(default_factory=UpgradeParams)
     descent: DescentParams = field(default_factory=DescentParams)
+    smoothing: SmoothingParams = field(default_factory=SmoothingParams)
     coarse: float = 0.1
     fine: float = 0.003
     finest: float = 0.0001
@@ -66,27 +71,33 @@ class MarginalParams:
     modes: int = 40
     fill_rank: int = 9
     noise_share: float = 0.25
+    noise_agrees: float = 2.25
 
 
-def _noise_variance(stack: Float[Tensor, "rows points"], share: float) -> float:
-    """Noise variance of the entries, read off the smallest ``share`` of the eigenvalues by the Marchenko-Pastur law.
+def _noise_variance(data: Observations, complete: Float[Tensor, "frames points 2"], params: MarginalParams) -> float:
+    """Noise variance of the entries, read off the smallest eigenvalues by the Marchenko-Pastur law, or off time.
 
     Small deformations of a noise-free body fill the middle of the spectrum, so its end is read and no rank is needed.
+    That end is off where entries are missing: completed ones bring the error of their model or no noise at all. Third
+    differences are exact at any share of gaps, but only for smooth tracks: they are taken where they agree.
     """
+    stack = (complete - complete.mean(1, keepdim=True)).mT.flatten(0, 1)
     n, d = max(stack.shape), min(stack.shape[0], stack.shape[1] - 1)
     eigenvalues = torch.linalg.svdvals(stack)[:d].square() / n
-    count = max(1, int(share * d))
-    return float(eigenvalues[-count:].mean()) / marchenko_pastur_tail(d / n, share)
+    count = max(1, int(params.noise_share * d))
+    spectral = float(eigenvalues[-count:].mean()) / marchenko_pastur_tail(d / n, params.noise_share)
+    temporal = float(difference_noise(data.xy.detach(), data.visible))
+    return temporal if temporal < params.noise_agrees * spectral else spectral
 
 
-def _views(data: Observations, stack: Tensor, share: float) -> Views:
-    """Observations with their covariance, or one common variance read off the end of the spectrum."""
+def _views(data: Observations, complete: Tensor, params: MarginalParams) -> Views:
+    """Observations with their covariance, or one common variance read off the tracks."""
     eye = torch.eye(2, dtype=data.xy.dtype, device=data.xy.device)
     if data.noise_known:
         information = data.weight.mT @ data.weight
         noise = torch.linalg.inv(torch.where(data.visible[..., None, None], information, eye))
     else:
-        noise = _noise_variance(stack, share) * eye.expand(*data.xy.shape, 2)
+        noise = _noise_variance(data, complete.detach(), params) * eye.expand(*data.xy.shape, 2)
     return Views(data.xy, data.visible, noise)
 
 
@@ -107,61 +118,86 @@ def _rigid_model(xy: Tensor, rotations: Tensor) -> ShapeModel:
 def solve_marginal(
     item: Tracks, rank: int, generator: torch.Generator, params: MarginalParams | None = None
 ) -> Reconstruction:
-    """Solve one sequence; computed in float64, returned in the type of the tracks."""
+    """Solve one sequence; computed in float64, returned in the type of the tracks.
+
+    Where the tracks ask for gradients, the descent goes on to the optimum by Newton's method and the answer is
+    differentiated there (see ``implicit``); completion of gaps and a noise level that was not given are held.
+    """
     params = params or MarginalParams()
     dtype = item.xy.dtype
+    data = observe(item.to(dtype=torch.float64))
     with torch.no_grad():
-        data = observe(item.to(dtype=torch.float64))
         small = check_size(item, 1) or _shapeless(data)
         if small is not None:
             return _flat(data, rank, small).to(dtype=dtype)
-        complete, centre = filled(data, params.fill_rank)
-        stack = (complete - centre[:, None]).mT.flatten(0, 1)
-        found = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
-        starts = [start[2] for start in found[: params.starts]]
-        starts += [gram_upgrade(stack, 3 * bases, scaled=False).rotations for bases in params.gram_bases]
-        rotations = torch.stack(starts)
-        model = _rigid_model(complete, rotations)
-        views = _views(data, stack, params.noise_share)
-        noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
-        noise = noise if noise > params.fine**2 else 0.0  # below the last residual it is a part of that
-        fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
-        eps, level, before = params.coarse, 0, -1
-        value = torch.full_like(model.scale[:, 0], torch.inf)
-        while True:
-            # What the loadings avoid follows the mean shape only in a growth, so the last level grows again and again.
-            for turn in range(params.last_rounds if level == params.levels - 1 else 1):
-                for _ in range(params.growths):
-                    model = grow_loadings(views, model, eps, params.modes, noise)
-                last = value
-                model, value, converged = descend(views, model, eps, params.steps, params.descent)
-                if turn and float((last - value).amax()) < params.settled * len(data.xy):
-                    converged = True
-                    break
-            if level == params.trial_levels - 1:
-                model = model.pick(int(value.argmin()))
-            # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly.
-            modes = model.loadings.shape[-1]
-            if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
+    complete, centre = filled(data, params.fill_rank)
+    views = smoothed(_views(data, complete, params), complete, params.smoothing)
+    asked = torch.is_grad_enabled() and (views.xy.requires_grad or views.noise.requires_grad)
+    with torch.no_grad():
+        fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
+        model, eps, starts, converged = _search(fixed, (complete - centre[:, None]).detach(), generator, params)
+        if asked:
+            model = settled(fixed, model, eps)
+    if asked:
+        model = attached(views, model, eps)
+    answer = evaluate(views, model, eps, with_spread=True)
+    assert answer.spread is not None
+    complaint = None if converged else "the likelihood still rose when the rounds of growth and descent were over"
+    # What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in
+    # pixels of the tracks in every frame.
+    answered = conclude(
+        data,
+        answer.points[0],
+        model.rotations[0],
+        torch.ones_like(model.scale[0]),
+        answer.translation[0],
+        rank=rank,
+        complaint=complaint,
+        summary=f"likeliest of {starts} starts, {model.loadings.shape[-1]} modes",
+        covariance3d=_covariance(views, model, answer, answer.spread[0], eps),
+    )
+    return answered.to(dtype=dtype)
+
+
+def _search(
+    views: Views, complete: Tensor, generator: torch.Generator, params: MarginalParams
+) -> tuple[ShapeModel, float, int, bool]:
+    """The likeliest model: from the coarse residual to the fine one, from several starts until one is the likeliest.
+
+    Args:
+        complete: (frames, points, 2) centred tracks without gaps, for the starts.
+
+    Returns:
+        model, a batch of one; deviation of its residual; number of starts; whether the last descent converged.
+    """
+    stack = complete.mT.flatten(0, 1)
+    found = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
+    starts = [start[2] for start in found[: params.starts]]
+    starts += [gram_upgrade(stack, 3 * bases, scaled=False).rotations for bases in params.gram_bases]
+    rotations = torch.stack(starts)
+    model = _rigid_model(complete, rotations)
+    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+    noise = noise if noise > params.fine**2 else 0.0  # below the last residual it is a part of that
+    fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
+    eps, level, before = params.coarse, 0, -1
+    value = torch.full_like(model.scale[:, 0], torch.inf)
+    while True:
+        # What the loadings avoid follows the mean shape only in a growth, so the last level grows again and again.
+        for turn in range(params.last_rounds if level == params.levels - 1 else 1):
+            for _ in range(params.growths):
+                model = grow_loadings(views, model, eps, params.modes, noise)
+            last = value
+            model, value, converged = descend(views, model, eps, params.steps, params.descent)
+            if turn and float((last - value).amax()) < params.settled * len(complete):
+                converged = True
                 break
-            eps, level, before = eps * fall, level + 1, modes
-        answer = evaluate(views, model, eps, with_spread=True)
-        assert answer.spread is not None
-        complaint = None if converged else "the likelihood still rose when the rounds of growth and descent were over"
-        # What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in
-        # pixels of the tracks in every frame.
-        answered = conclude(
-            data,
-            answer.points[0],
-            model.rotations[0],
-            torch.ones_like(model.scale[0]),
-            answer.translation[0],
-            rank=rank,
-            complaint=complaint,
-            summary=f"likeliest of {len(rotations)} starts, {model.loadings.shape[-1]} modes",
-            covariance3d=_covariance(views, model, answer, answer.spread[0], eps),
-        )
-        return answered.to(dtype=dtype)
+        if level == params.trial_levels - 1:
+            model = model.pick(int(value.argmin()))
+        # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly.
+        modes = model.loadings.shape[-1]
+        if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
+            return model, eps, len(rotations), converged
+        eps, level, before = eps * fall, level + 1, modes
 
 
 def _covariance(

@@ -15,7 +15,7 @@ import torch
 from torchrecon._typing import Tensor
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, moved
 
-__all__ = ["DescentParams", "descend"]
+__all__ = ["DescentParams", "Direction", "added", "descend", "inner", "metric", "scaled"]
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,18 @@ class DescentParams:
 Direction = tuple[Tensor, Tensor, Tensor]
 
 
-def _dot(a: Direction, b: Direction) -> Tensor:
+def inner(a: Direction, b: Direction) -> Tensor:
     """Inner product per item (b,)."""
     return sum(((x * y).flatten(1).sum(1) for x, y in zip(a, b, strict=True)), torch.zeros_like(a[0][:, 0, 0]))
 
 
-def _add(a: Direction, factor: Tensor, b: Direction) -> Direction:
+def added(a: Direction, factor: Tensor, b: Direction) -> Direction:
     """``a + factor * b`` with one factor per item."""
     pose, mean, loadings = (x + factor.view(-1, *[1] * (x.ndim - 1)) * y for x, y in zip(a, b, strict=True))
     return pose, mean, loadings
 
 
-def _scaled(factor: Tensor, a: Direction) -> Direction:
+def scaled(factor: Tensor, a: Direction) -> Direction:
     """``a`` with one factor per item."""
     pose, mean, loadings = (factor.view(-1, *[1] * (x.ndim - 1)) * x for x in a)
     return pose, mean, loadings
@@ -61,7 +61,7 @@ def _gradient(at: Evaluation) -> Direction:
     return at.pose, at.mean, at.loadings
 
 
-def _metric(model: ShapeModel, fisher: Tensor, residual: Tensor) -> Callable[[Direction], Direction]:
+def metric(model: ShapeModel, fisher: Tensor, residual: Tensor) -> Callable[[Direction], Direction]:
     """The inverse information of poses, mean and loadings, as a function on gradients."""
     frames, modes = model.scale.shape[-1], model.loadings.shape[-1]
     eye = torch.eye(4, dtype=fisher.dtype, device=fisher.device)
@@ -100,27 +100,27 @@ def descend(
     pairs: list[tuple[Direction, Direction, Tensor]] = []
     done = torch.zeros_like(now.value, dtype=torch.bool)
     for _ in range(steps):
-        metric = _metric(model, now.pose_fisher, residual)
+        precondition = metric(model, now.pose_fisher, residual)
         q, kept = _gradient(now), []
         for step, change, weight in reversed(pairs):
-            share = weight * _dot(step, q)
-            q = _add(q, -share, change)
+            share = weight * inner(step, q)
+            q = added(q, -share, change)
             kept.append(share)
-        q = metric(q)
+        q = precondition(q)
         for (step, change, weight), share in zip(pairs, reversed(kept), strict=True):
-            q = _add(q, share - weight * _dot(change, q), step)
-        slope = -_dot(q, _gradient(now))
+            q = added(q, share - weight * inner(change, q), step)
+        slope = -inner(q, _gradient(now))
         # A direction that does not descend starts the memory of its item anew.
         lost = slope >= 0
         if bool(lost.any()):
             share = lost.to(slope.dtype)
-            q = _add(_scaled(1 - share, q), share, metric(_gradient(now)))
-            slope = -_dot(q, _gradient(now))
+            q = added(scaled(1 - share, q), share, precondition(_gradient(now)))
+            slope = -inner(q, _gradient(now))
             pairs = [(s, c, torch.where(lost, torch.zeros_like(w), w)) for s, c, w in pairs]
         turn = q[0][..., :3].norm(dim=-1).amax(-1)
         length = torch.where(done, torch.zeros_like(turn), (params.turn / turn.clamp_min(1e-300)).clamp_max(1.0))
         for _ in range(params.halvings):
-            step = _scaled(-length, q)
+            step = scaled(-length, q)
             trial = moved(model, *step)
             then = evaluate(views, trial, eps)
             good = (then.value <= now.value + params.sufficient * length * slope) | (length == 0)
@@ -129,11 +129,11 @@ def descend(
             length = torch.where(good, length, 0.4 * length)
         length = torch.where(good, length, torch.zeros_like(length))
         if not bool(good.all()):
-            step = _scaled(-length, q)
+            step = scaled(-length, q)
             trial = moved(model, *step)
             then = evaluate(views, trial, eps)
-        change = _add(_gradient(then), -torch.ones_like(length), _gradient(now))
-        curvature = _dot(step, change)
+        change = added(_gradient(then), -torch.ones_like(length), _gradient(now))
+        curvature = inner(step, change)
         usable = curvature > 1e-10 * (length * slope).abs()
         weight = torch.where(usable, 1 / curvature.where(usable, torch.ones_like(curvature)), torch.zeros_like(turn))
         pairs = [*pairs, (step, change, weight)][-params.memory :]

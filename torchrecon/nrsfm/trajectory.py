@@ -339,16 +339,18 @@ def _at_distance(data: Observations, depth: Tensor, path: CameraPath, canonical:
 def solve_trajectories(
     item: Tracks, rank: int, generator: torch.Generator, params: TrajectoryParams | None = None
 ) -> Reconstruction:
-    """Solve one sequence of any visibility; see the module's text. Nothing is random, ``generator`` is not used."""
+    """Solve one sequence of any visibility; see the module's text. Nothing is random, ``generator`` is not used.
+
+    Gradients go through the posterior of the points, with camera path and kernels held.
+    """
     params = params or TrajectoryParams()
     data = observe(item)
-    found = find_path(data, params)
-    with torch.no_grad():
-        packed = pack(data)
+    found = find_path(observe(item.detach()), params)
+    packed = pack(data)
+    canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
+    if item.depth is not None and item.intrinsics is not None:
+        found = replace(found, path=_at_distance(data, item.depth, found.path, canonical))
         canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
-        if item.depth is not None and item.intrinsics is not None:
-            found = replace(found, path=_at_distance(data, item.depth, found.path, canonical))
-            canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
     return place_points(data, found, canonical, spread, rank, params)
 
 

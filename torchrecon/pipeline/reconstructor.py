@@ -61,7 +61,7 @@ def reconstruct(
             )
         solve = with_prior(solve, prior)
     if rank == "auto":
-        estimate = estimate_rank(tracks, generator=generator)
+        estimate = estimate_rank(tracks.detach(), generator=generator)
         answer = solve(tracks, estimate.rank, generator=generator)
         return replace(answer, deformation_degree=estimate.deformation_degree)
     if isinstance(rank, bool) or not isinstance(rank, int) or rank < 1:
