@@ -70,7 +70,7 @@ def solve_windows(
         said = answer.statuses[0]
         if not said.ok and status.ok:
             frames = f"frames {first} to {first + length - 1}"
-            status = replace(answer.status, text=f"window {number + 1} of {len(starts)}, {frames}: {said.text}")
+            status = replace(said, text=f"window {number + 1} of {len(starts)}, {frames}: {said.text}")
         if whole:
             shared = len(whole["scale"]) - first
             if float((whole["points3d"][first:, :, 2] * answer.points3d[:shared, :, 2]).sum()) < 0:
