@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
 
-.PHONY: setup table1 test fuzz lint kill page clean
+.PHONY: setup table1 test fuzz lint kill page docs clean
 
 setup: $(VENV)/.stamp
 
@@ -36,5 +36,10 @@ kill: setup
 page: setup
 	$(BIN)/python -m eval.page
 
+# The documentation site in docs/_build/html; warnings are errors, nothing is fetched once its packages are there.
+docs: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache build *.egg-info
+	rm -rf $(VENV) docs/_build docs/pictures docs/reference .mypy_cache .ruff_cache .pytest_cache .import_linter_cache build *.egg-info

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -28,34 +29,37 @@ class Reader:
 
 
 def readers_of(
-    sequences: list[Sequence], data: str | None, smoke: bool, folder: Path
-) -> dict[tuple[Views, int], Reader]:
-    """The recogniser of 3D shapes and that of 2D views for every fold; missing ones are trained by the job.
+    sequences: list[Sequence], data: str | None, smoke: bool, folder: Path, seeds: int = 1
+) -> dict[tuple[Views, int, int], Reader]:
+    """The recogniser of 3D shapes and that of 2D views for every fold and seed; missing ones are trained by the job.
 
     Args:
         sequences: what will be read; a fold's recogniser is trained without the subjects of that fold.
         data: mocap file, or None for the synthetic world, which has a single fold and one shared checkpoint.
         smoke: a few epochs on few films, kept apart from the real ones.
         folder: for the checkpoints of smoke runs and of folds.
+        seeds: recognisers of each kind; the first is the one that a single one is.
     """
-    readers: dict[tuple[Views, int], Reader] = {}
+    readers: dict[tuple[Views, int, int], Reader] = {}
+    kinds: tuple[Views, ...] = ("3d", "2d")
     for fold in sorted({item.fold for item in sequences}):
         subjects = sorted({item.subject for item in sequences if item.fold == fold})
-        views: Views
-        for views in ("3d", "2d"):
-            tail = "_2d" if views == "2d" else ""
+        for seed, views in itertools.product(range(seeds), kinds):
+            tail = ("_2d" if views == "2d" else "") + (f"_seed{seed}" if seed else "")
             if data is None and not smoke:
                 path = ROOT / "runs" / "recogniser" / f"recogniser{tail}.safetensors"
             else:
                 path = folder / f"recogniser{'' if data is None else f'_fold{fold}'}{tail}.safetensors"
             arguments = ["--views", views, "--out", str(path)]
+            if seed:
+                arguments += ["--seed", str(seed)]
             if data is not None:
                 arguments += ["--data", data, "--exclude", ",".join(subjects)]
             if smoke:
                 arguments += _SMOKE
             if not _usable(path):
                 _train(path, arguments)
-            readers[views, fold] = Reader(str(path), weights_hash(load_recogniser(path)))
+            readers[views, fold, seed] = Reader(str(path), weights_hash(load_recogniser(path)))
     return readers
 
 

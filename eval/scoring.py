@@ -11,7 +11,7 @@ import torch
 
 from torchrecon._typing import Float, Tensor
 
-__all__ = ["PAPER", "Cell", "bootstrap_cells", "draw", "table_text"]
+__all__ = ["PAPER", "Cell", "bootstrap_cells", "draw", "error_by_action", "table_text"]
 
 PAPER: dict[str, tuple[float, float, float, float]] = {
     "ref4": (28.14, 27.46, 28.96, 28.36),
@@ -37,12 +37,13 @@ class Cell:
 
 
 def bootstrap_cells(
-    wrong: Mapping[str, Sequence[tuple[int, int]]], seed: int = 0, draws: int = 2000
+    wrong: Mapping[str, Sequence[tuple[float, int]]], seed: int = 0, draws: int = 2000
 ) -> dict[str, Cell]:
     """A cell per action and their ``mean``; sequences, not windows, are drawn anew, as windows of one film overlap.
 
     Args:
-        wrong: per action a pair (wrong windows, windows) for each of its sequences.
+        wrong: per action a pair (wrong windows, windows) for each of its sequences; the former may be a mean over
+            recognisers.
         seed: of the draws.
         draws: bootstrap samples.
 
@@ -68,6 +69,17 @@ def bootstrap_cells(
     count = sum(cell.sequences for cell in cells.values())
     cells["mean"] = _cell(sum(shares) / len(shares), mean, windows, count)
     return cells
+
+
+def error_by_action(wrong: Mapping[str, Sequence[tuple[float, int]]]) -> dict[str, float]:
+    """Per cent of windows that are wrong, per action and as their ``mean``.
+
+    Example:
+        >>> error_by_action({"run": [(2, 8), (0, 8)], "jump": [(4, 8), (4, 8)]})
+        {'run': 12.5, 'jump': 50.0, 'mean': 31.25}
+    """
+    errors = {name: 100 * sum(w for w, _ in pairs) / sum(n for _, n in pairs) for name, pairs in wrong.items()}
+    return {**errors, "mean": sum(errors.values()) / len(errors)}
 
 
 def _cell(error: float, sample: Float[Tensor, " draws"], windows: int, sequences: int) -> Cell:

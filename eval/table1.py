@@ -22,7 +22,7 @@ from eval.predict import load_row, open_caches, predict, tracks_path
 from eval.recognisers import Reader, readers_of
 from eval.rows import FLAT, TRUE_3D, VIEWS_2D, Row, RowOutput, rows_of
 from eval.rows.template import save_prior, train_prior
-from eval.scoring import PAPER, bootstrap_cells, draw, table_text
+from eval.scoring import PAPER, bootstrap_cells, draw, error_by_action, table_text
 from eval.sequences import ACTIONS, Filmed, Filming, Sequence, mocap_sequences, synthetic_sequences
 from torchrecon.errors import ReconError
 from torchrecon.metrics import error3d_camera, nrmse
@@ -54,21 +54,31 @@ def _prior_bodies(smoke: bool) -> int:
 
 
 def _read(
-    recogniser: Recogniser, points3d: torch.Tensor, visible: torch.Tensor, filmed: Filmed, action: str
-) -> tuple[int, int]:
-    """(wrong windows, windows) of one sequence; the only way from points to a verdict, for every row and the truth."""
-    scores = classify_windows(recogniser, points3d, visible, filmed.rotations)
-    wrong = sum(recogniser.classes[index] != action for index in scores.predicted.tolist())
-    return wrong, len(scores.predicted)
+    recognisers: list[Recogniser], points3d: torch.Tensor, visible: torch.Tensor, filmed: Filmed, action: str
+) -> tuple[list[int], int]:
+    """Wrong windows of one sequence by recogniser, and its windows; the only way from points to a verdict, for every
+    row and the truth.
+    """
+    wrong, windows = [], 0
+    for recogniser in recognisers:
+        named = classify_windows(recogniser, points3d, visible, filmed.rotations).predicted.tolist()
+        wrong.append(sum(recogniser.classes[index] != action for index in named))
+        windows = len(named)
+    return wrong, windows
 
 
 def score(
     films: Path, folder: Path, sequences: list[Sequence], rows: tuple[Row, ...], readers: dict[Any, Reader], seed: int
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Second pass: what the cached predictions are worth, row by row, and what has to be said about them."""
-    loaded = {key: load_recogniser(reader.path) for key, reader in readers.items()}
-    counts: dict[str, dict[str, list[tuple[int, int]]]] = {row.key: {} for row in rows}
-    by_source: dict[str, dict[str, list[tuple[int, int]]]] = {row.key: {} for row in rows}
+    """Second pass: what the cached predictions are worth, row by row, and what has to be said about them.
+
+    Each answer is read by every seed's recogniser; a sequence counts with the mean over them.
+    """
+    loaded: dict[tuple[str, int], list[Recogniser]] = {}
+    for (kind, fold, _), reader in sorted(readers.items()):
+        loaded.setdefault((kind, fold), []).append(load_recogniser(reader.path))
+    counts: dict[str, dict[str, list[tuple[list[int], int]]]] = {row.key: {} for row in rows}
+    by_source: dict[str, dict[str, list[tuple[list[int], int]]]] = {row.key: {} for row in rows}
     errors: dict[str, dict[str, list[tuple[float, float]]]] = {row.key: {} for row in rows}
     notes: dict[str, dict[str, str]] = {row.key: {} for row in rows}
     from tqdm import tqdm
@@ -80,18 +90,18 @@ def score(
         truth = torch.nan_to_num(filmed.truth)
         for row in rows:
             views = "2d" if row is VIEWS_2D else "3d"
-            recogniser = loaded[views, item.fold]
+            recognisers = loaded[views, item.fold]
             if row is TRUE_3D:
                 answer: RowOutput | str = RowOutput(truth, scored)
             else:
                 answer = load_row(folder, FLAT.key if row is VIEWS_2D else row.key, item.name)
             if isinstance(answer, str):
                 notes[row.key][item.name] = f"no answer: {answer}"
-                windows = _read(recogniser, truth, scored, filmed, item.action)[1]
-                result = (windows, windows)
+                windows = _read(recognisers[:1], truth, scored, filmed, item.action)[1]
+                result = ([windows] * len(recognisers), windows)
             else:
                 visible = answer.visible & scored
-                result = _read(recogniser, answer.points3d, visible, filmed, item.action)
+                result = _read(recognisers, answer.points3d, visible, filmed, item.action)
                 notes[row.key][item.name] = answer.note
                 if row not in (TRUE_3D, VIEWS_2D):
                     pair = tuple(
@@ -115,6 +125,7 @@ def _row_result(row: Row, counts: Any, by_source: Any, errors: Any, notes: Any, 
             name: sum(pair[name] for pair in figures.values()) / len(figures) for name in ("nrmse", "error3d_camera")
         }
     ordered = {action: counts[row.key][action] for action in ACTIONS if action in counts[row.key]}
+    seeds = range(len(next(iter(ordered.values()))[0][0]))
     paper = dict(zip(ACTIONS, PAPER[row.key], strict=True)) if row.key in PAPER else {}
     return {
         "key": row.key,
@@ -123,14 +134,27 @@ def _row_result(row: Row, counts: Any, by_source: Any, errors: Any, notes: Any, 
         "filled": row.filled,
         "uses_depth": row.uses_depth,
         "paper": paper,
-        "cells": {name: asdict(cell) for name, cell in bootstrap_cells(ordered, seed).items()},
+        "cells": {
+            name: asdict(cell)
+            for name, cell in bootstrap_cells({k: _over_seeds(v) for k, v in ordered.items()}, seed).items()
+        },
+        "by_seed": [error_by_action({k: [(w[s], n) for w, n in v] for k, v in ordered.items()}) for s in seeds],
         "by_source": {
-            name: {"wrong": sum(w for w, _ in pairs), "windows": sum(n for _, n in pairs), "sequences": len(pairs)}
+            name: {
+                "wrong": sum(w for w, _ in _over_seeds(pairs)),
+                "windows": sum(n for _, n in pairs),
+                "sequences": len(pairs),
+            }
             for name, pairs in by_source[row.key].items()
         },
         "errors": figures,
         "notes": notes[row.key],
     }
+
+
+def _over_seeds(counts: list[tuple[list[int], int]]) -> list[tuple[float, int]]:
+    """(wrong windows, windows) of each sequence, the former as the mean over the recognisers."""
+    return [(sum(wrong) / len(wrong), windows) for wrong, windows in counts]
 
 
 def _remarks(rows: tuple[Row, ...], table: list[dict[str, Any]], notes: dict[str, dict[str, str]]) -> list[str]:
@@ -178,7 +202,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
         times = predict(films, cache, sequences, filming, out, (), arguments.seed, arguments.workers)
         print(times.text())
         return {}
-    readers = readers_of(sequences, arguments.data, arguments.smoke, out)
+    readers = readers_of(sequences, arguments.data, arguments.smoke, out, arguments.recogniser_seeds)
     profile = Profile()
     prior = cache.path("prior.npz")
     if not prior.is_file():
@@ -189,6 +213,8 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
     profile.merge(predict(films, cache, sequences, filming, prior, keys, arguments.seed, arguments.workers))
     with profile("recogniser (reading)"):
         table, remarks = score(films.folder, cache.folder, sequences, rows, readers, arguments.seed)
+    if arguments.recogniser_seeds > 1:
+        remarks += _seed_lines(table)
     actions = [action for action in ACTIONS if any(item.action == action for item in sequences)]
     cells = {
         action: {
@@ -209,7 +235,11 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
         "counts": cells,
         "rows": table,
         "remarks": remarks,
-        "recognisers": {f"{views} fold {fold}": asdict(reader) for (views, fold), reader in readers.items()},
+        "recognisers": {
+            f"{views} fold {fold}" + (f" seed {seed}" if seed else ""): asdict(reader)
+            for (views, fold, seed), reader in readers.items()
+        },
+        "recogniser_seeds": arguments.recogniser_seeds,
         "config": {**films.config, **cache.config},
         "profile": profile.stages,
         "provenance": provenance("cpu", arguments.seed),
@@ -225,6 +255,17 @@ def _source_lines(table: list[dict[str, Any]]) -> list[str]:
             for name, value in sorted(row["by_source"].items())
         ]
         lines.append(f"  {row['label']:<26} " + ", ".join(parts))
+    return lines
+
+
+def _seed_lines(table: list[dict[str, Any]]) -> list[str]:
+    """How much of a figure is the luck of one training."""
+    lines = [
+        f"Cells are means over {len(table[0]['by_seed'])} recognisers; the mean column by recogniser, lowest - highest:"
+    ]
+    for row in table:
+        means = [errors["mean"] for errors in row["by_seed"]]
+        lines.append(f"  {row['label']:<26} {min(means):.1f} - {max(means):.1f}")
     return lines
 
 
@@ -252,6 +293,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--data", metavar="FILE", help="mocap .npz: real motion, leave-subjects-out in 5 folds")
     parser.add_argument("--turn", type=float, default=300.0, help="degrees that the camera turns in all")
     parser.add_argument("--per-action", type=int, default=10, help="test sequences of each action")
+    parser.add_argument(
+        "--recogniser-seeds", type=int, default=1, metavar="N", help="read with N recognisers, report their mean"
+    )
     parser.add_argument("--smoke", action="store_true", help="small: ends in 90 s")
     parser.add_argument("--only-films", action="store_true", help="film and track, then stop; the rows come later")
     parser.add_argument("--profile", action="store_true", help="print what each stage took")
@@ -260,6 +304,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--out", metavar="DIR", help="default: runs/table1-REGIME...")
     arguments = parser.parse_args(argv)
+    if arguments.recogniser_seeds < 1:
+        parser.error("--recogniser-seeds: must be at least 1")
     torch.set_num_threads(1)
     started = time.perf_counter()
     try:

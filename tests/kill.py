@@ -1,7 +1,7 @@
 """SIGKILL at random moments: no broken file under a final name, and the next run ends as an undisturbed one.
 
-``python -m tests.kill [--moments N]`` kills ``batch`` on tracks files and ``reconstruct`` on a short film; `make kill`
-runs it, the test suite kills once.
+``python -m tests.kill [--moments N] [--only JOB]`` kills ``batch`` on tracks files, ``reconstruct`` on a short film and
+a small training of the recogniser; `make kill` runs it, the test suite kills ``batch`` and the training once each.
 """
 
 from __future__ import annotations
@@ -21,14 +21,21 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["check_whole", "die_on_two", "kill_after", "results"]
+__all__ = ["SMALL_TRAINING", "check_whole", "die_on_two", "kill_after", "results"]
 
 ROOT = Path(__file__).resolve().parents[1]
+SMALL_TRAINING = [
+    "--data.films=12",
+    "--data.points=80",
+    "--data.validation_films=0",
+    "--data.batch_size=6",
+    "--trainer.enable_progress_bar=false",
+]
 
 
 def _start(command: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-m", "torchrecon", *command],
+        [sys.executable, "-m", *command],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -37,12 +44,12 @@ def _start(command: list[str]) -> subprocess.Popen[bytes]:
 
 
 def kill_after(command: list[str], moment: Callable[[], bool], limit: float = 120.0) -> bool:
-    """Run the command line and kill it as soon as ``moment()``; True where it came to that."""
+    """Run a module with its arguments and kill it as soon as ``moment()``; True where it came to that."""
     process = _start(command)
     end = time.monotonic() + limit
     while process.poll() is None and not moment():
         if time.monotonic() > end:
-            raise TimeoutError(f"{command[0]} was still running after {limit:g} s")
+            raise TimeoutError(f"{' '.join(command[:2])} was still running after {limit:g} s")
         time.sleep(0.002)
     killed = process.poll() is None
     if killed:
@@ -75,6 +82,14 @@ def check_whole(folder: Path) -> None:
 
             assert path.read_bytes().endswith(b"IEND\xaeB`\x82"), path
             assert cv2.imread(str(path)) is not None, path
+        elif path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            assert load_file(path), path
+        elif path.suffix == ".ckpt":
+            import torch
+
+            assert torch.load(path, weights_only=True)["state_dict"], path
         elif path.suffix == ".html":
             assert path.read_text().rstrip().endswith("</html>"), path
         else:
@@ -107,16 +122,20 @@ def _film(folder: Path) -> None:
     film(folder, depth=False)
 
 
-def _kill_at_random_moments(command: Callable[[Path], list[str]], work: Path, moments: int, seed: int) -> None:
-    work.mkdir()
-    calm, out, name = work / "calm", work / "out", command(work)[0]
+def _kill_at_random_moments(
+    name: str, command: Callable[[Path], list[str]], work: Path, moments: int, seed: int, longest: float = 0.5
+) -> None:
+    """``longest``: seconds after a result appeared, or after the start, in which the kill comes."""
+    work = work / name
+    work.mkdir(parents=True)
+    calm, out = work / "calm", work / "out"
     assert _start(command(calm)).wait() == 0
     wanted = results(calm)
     draw = random.Random(seed)
     hits = 0
     for number in range(moments):
         # Drawn by what is there and not by the clock: half of a short run is the loading of libraries.
-        least, wait, seen = draw.randrange(len(wanted)), draw.uniform(0, 0.5), []
+        least, wait, seen = draw.randrange(len(wanted)), draw.uniform(0, longest), []
 
         def moment(least: int = least, wait: float = wait, seen: list[float] = seen) -> bool:
             if not seen and sum(path.is_file() for path in out.rglob("*")) >= least:
@@ -138,26 +157,33 @@ def _kill_at_random_moments(command: Callable[[Path], list[str]], work: Path, mo
 
 
 def main() -> None:
-    """Kill both commands at random moments."""
+    """Kill each job at random moments."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--moments", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=["batch", "reconstruct", "train"])
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        work = Path(name)
-        _tracks(work / "tracks", 6)
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
         quick = ["--rank", "1", "--solver", "rigid"]
-        _kill_at_random_moments(
-            lambda out: ["batch", str(work / "tracks"), "-o", str(out), "--workers", "2", *quick],
-            work / "a",
-            options.moments,
-            options.seed,
-        )
-        _film(work / "film")
         clip = [str(work / "film" / "frames"), "--masks", str(work / "film" / "masks")]
-        _kill_at_random_moments(
-            lambda out: ["reconstruct", *clip, "-o", str(out), *quick], work / "b", options.moments, options.seed
-        )
+        tracks = [str(work / "tracks"), "--workers", "2"]
+        small = [*SMALL_TRAINING, "--trainer.max_epochs=4"]
+        jobs: dict[str, Callable[[Path], list[str]]] = {
+            "batch": lambda out: ["torchrecon", "batch", *tracks, "-o", str(out), *quick],
+            "reconstruct": lambda out: ["torchrecon", "reconstruct", *clip, "-o", str(out), *quick],
+            "train": lambda out: ["train.recogniser", "--out", str(out / "recogniser.safetensors"), *small],
+        }
+        for name, command in jobs.items():
+            if options.only not in (None, name):
+                continue
+            if name == "batch":
+                _tracks(work / "tracks", 6)
+            elif name == "reconstruct":
+                _film(work / "film")
+            # Training spends seconds on its films and some on each epoch, between which nothing appears.
+            longest = 8.0 if name == "train" else 0.5
+            _kill_at_random_moments(name, command, work / "runs", options.moments, options.seed, longest)
 
 
 if __name__ == "__main__":

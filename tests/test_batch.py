@@ -160,7 +160,7 @@ def test_a_process_that_dies_loses_its_item_only():
 def test_a_killed_batch_leaves_whole_files_and_the_next_run_finishes(folder, tmp_path):
     run_batch(folder, tmp_path / "calm", SETTINGS, workers=0)
     out = tmp_path / "out"
-    command = ["batch", str(folder), "-o", str(out), "--rank", "1", "--solver", "rigid", "--workers", "0"]
+    command = ["torchrecon", "batch", str(folder), "-o", str(out), "--rank", "1", "--solver", "rigid", "--workers", "0"]
     assert kill_after(command, lambda: (out / "a" / "reconstruction.npz").exists())
     check_whole(out)
     run_batch(folder, out, SETTINGS, workers=0)

@@ -1,4 +1,5 @@
-"""torch.export and torch.compile take the recogniser and the covariance, for any number of frames and points.
+"""torch.export and torch.compile take the recogniser, the covariance and equations (1) to (5) of SIFT, for any number
+of frames, points and pixels.
 
 In a process of its own: the shape checks of the test session are Python that the compiler cannot trace.
 """
@@ -27,6 +28,17 @@ class Covariance(torch.nn.Module):
 module, image, xy = Covariance(), torch.rand(1, 64, 80), 8 + 50 * torch.rand(12, 2)
 inputs, others, shapes = (image, xy), (image, xy[:5]), ({}, {0: Dim("points", min=2, max=5000)})
 """
+SIFT = """
+from torchrecon.features.sift import difference_of_gaussians, gradient_polar, smooth
+
+class Sift(torch.nn.Module):
+    def forward(self, image):
+        magnitude, angle = gradient_polar(smooth(image, 1.6))
+        return difference_of_gaussians(image, 1.6), magnitude, angle.cos()  # a turn by 2 pi is none
+
+module, size = Sift(), {0: Dim("height", min=32, max=2000), 1: Dim("width", min=32, max=2000)}
+inputs, others, shapes = (torch.rand(48, 64),), (torch.rand(60, 50),), (size,)
+"""
 CHECK = """
 exported = torch.export.export(module, inputs, dynamic_shapes=shapes)
 torch.testing.assert_close(exported.module()(*others), module(*others))
@@ -35,6 +47,7 @@ torch.testing.assert_close(torch.compile(module, backend="aot_eager", fullgraph=
 
 
 def test_exported_and_compiled_give_the_same():
-    code = f"import torch\nfrom torch.export import Dim\ntorch.manual_seed(0)\n{RECOGNISER}{CHECK}{COVARIANCE}{CHECK}"
+    code = "import torch\nfrom torch.export import Dim\ntorch.manual_seed(0)\n"
+    code += "".join(part + CHECK for part in (RECOGNISER, COVARIANCE, SIFT))
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]

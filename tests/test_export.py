@@ -392,6 +392,31 @@ def test_rrd_without_rerun_says_how_to_get_it(rec, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_rrd_is_read_back_by_reruns_own_reader(tmp_path):
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    points = walker(6)
+    motion = Motion(points, fps=30.0, edges=tuple(EDGES), names=tuple(f"p{i}" for i in range(12)))
+    path = tmp_path / "a.rrd"
+    path.write_bytes(FORMATS[".rrd"](motion))
+    found = {}
+    for part in chunk.RrdReader(path).stream():
+        batch = part.to_record_batch()
+        for name in set(batch.schema.names) - {"log_time", "rerun.controls.RowId"}:
+            column = batch.column(name)
+            values = column.cast("int64") if name == "time" else column  # nanoseconds
+            found.setdefault((part.entity_path, name), []).extend(values.to_pylist())
+    positions = np.array(found["/shape/points", "Points3D:positions"])
+    order = np.argsort(found["/shape/points", "frame"])
+    np.testing.assert_allclose(positions[order], points, rtol=0, atol=1e-6)
+    assert sorted(found["/shape/points", "frame"]) == list(range(6))
+    seconds = np.array(found["/shape/points", "time"])[order] / 1e9
+    np.testing.assert_allclose(seconds, np.arange(6) / 30, atol=1e-8)
+    assert found["/shape/points", "Points3D:labels"][0] == list(motion.names)
+    strips = np.array(found["/shape/bones", "LineStrips3D:strips"])[np.argsort(found["/shape/bones", "frame"])]
+    np.testing.assert_allclose(strips, points[:, np.array(EDGES)], rtol=0, atol=1e-6)
+    assert found["/shape", "ViewCoordinates:xyz"] == [[[3, 2, 5]]]  # right, down, forward
+
+
 # --- units, names, refusals ------------------------------------------------------------------------------------------
 
 

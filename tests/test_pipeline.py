@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -76,12 +77,14 @@ def test_a_film_becomes_a_reconstruction_and_is_not_overwritten(tmp_path, capsys
     assert tr.Reconstruction.load(out / "reconstruction.npz").rank == 2
 
 
-def test_measured_depth_gives_metres(tmp_path):
+def test_measured_depth_gives_metres(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # as after a plain install, which ends with the page too
     clip = film(tmp_path, depth=True)
     out = tmp_path / "out"
     command = ["reconstruct", str(tmp_path / "frames"), "-o", str(out), "--masks", str(tmp_path / "masks")]
     command += ["--camera", str(tmp_path / "camera.json"), "--depth", str(tmp_path / "depth")]
     assert main(command) == 0
+    assert {path.name for path in out.glob("*.[ph]*")} == {"report.html"}
     tracks = tr.load_tracks(out / "tracks.npz")
     rec = tr.Reconstruction.load(out / "reconstruction.npz")
     measured = tracks.visible & torch.isfinite(tracks.depth)

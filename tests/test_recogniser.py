@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.kill import SMALL_TRAINING, check_whole, kill_after
 from torchrecon.data.mocap import MocapClip
 from torchrecon.data.synthetic import ACTIONS, sample_body, sample_motion
 from torchrecon.errors import ReconError
@@ -273,14 +274,22 @@ def test_a_distractor_without_clips_is_performed_by_the_synthetic_world(generato
     assert len(mocap_film(label + 1, clips, 60).points3d) < 60
 
 
-def test_training_job_ends_with_weights_and_does_nothing_twice(tmp_path):
+def test_training_job_that_is_killed_goes_on_and_does_nothing_twice(tmp_path):
     out = tmp_path / "recogniser.safetensors"
-    small = ["--data.films=12", "--data.points=80", "--data.validation_films=0", "--data.batch_size=6"]
-    words = ["--out", str(out), *small, "--trainer.max_epochs=1", "--trainer.enable_progress_bar=false"]
-    twice = f"from train.recogniser import main; main({words}); main({words})"
+    words = ["--out", str(out), *SMALL_TRAINING, "--trainer.max_epochs=2"]
+    assert kill_after(["train.recogniser", *words], lambda: any(tmp_path.rglob("last.ckpt")))
+    check_whole(tmp_path)
+    twice = f"""
+from train.recogniser import Training, main
+Training.on_train_epoch_start = lambda self: print("epoch", self.current_epoch)
+main({words})
+main({words})
+"""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     run = subprocess.run([sys.executable, "-c", twice], cwd=ROOT, capture_output=True, text=True, env=environment)
     assert run.returncode == 0, run.stderr[-2000:]
+    assert "epoch 0" not in run.stdout
+    assert "epoch 1" in run.stdout
     assert run.stdout.count("wrote") == run.stdout.count("already there") == 1
     assert load_recogniser(out).classes == (*ACTIONS, "flat")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["recogniser.json", "recogniser.safetensors"]

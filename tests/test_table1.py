@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from eval import table1
+from eval import recognisers, table1
 from eval.job import Cache, Profile, digest, plain, read_json, run_parallel, source_digest, write_arrays, write_json
 from eval.predict import load_row, row_path, tracks_path
 from eval.recognisers import Reader
@@ -208,7 +208,7 @@ def fake_run(folder: Path) -> tuple[list, dict]:
     recogniser = Recogniser(("shoot", "run", "jump", "pass"), ReadOut(views=("top",)))
     file = save_recogniser(recogniser, folder / "recogniser.safetensors")
     reader = Reader(str(file), weights_hash(recogniser))
-    return sequences, {("3d", 0): reader, ("2d", 0): reader}
+    return sequences, {("3d", 0, 0): reader, ("2d", 0, 0): reader}
 
 
 def test_scoring_reads_the_cache_and_counts_a_refusal_as_wrong(tmp_path):
@@ -250,3 +250,45 @@ def test_film_gives_tracks_with_their_truth():
     miss = (again - tracks.xy).norm(dim=-1)[seen]
     assert float(miss.median()) < 1.0  # truth and track are the same point of the body
     assert bool(torch.isfinite(filmed.hessian[tracks.visible]).all())
+
+
+def test_every_recogniser_reads_and_a_cell_is_their_mean(tmp_path):
+    sequences, readers = fake_run(tmp_path)
+    # Recognisers that always say the same: the first is wrong about the run, the second about the shot.
+    for seed, name in enumerate(("shoot", "run")):
+        recogniser = Recogniser(("shoot", "run", "jump", "pass"), ReadOut(views=("top",)))
+        with torch.no_grad():
+            recogniser.to_classes.bias[recogniser.classes.index(name)] = 1e3
+        file = save_recogniser(recogniser, tmp_path / f"recogniser_seed{seed}.safetensors")
+        for views in ("3d", "2d"):
+            readers[views, 0, seed] = Reader(str(file), weights_hash(recogniser))
+    rows = tuple(row for row in ROWS if row.key in ("default", "ref5", FLAT.key, TRUE_3D.key))
+    table, _ = table1.score(tmp_path, tmp_path, sequences, rows, readers, seed=0)
+    by_key = {row["key"]: row for row in table}
+    true = by_key[TRUE_3D.key]
+    assert {item.action for item in sequences} == {"shoot", "run"}
+    assert [true["cells"][name]["error"] for name in ("shoot", "run", "mean")] == [50.0, 50.0, 50.0]
+    assert true["by_seed"] == [{"shoot": 0.0, "run": 100.0, "mean": 50.0}, {"shoot": 100.0, "run": 0.0, "mean": 50.0}]
+    assert true["cells"]["run"]["windows"] == 2  # of one recogniser, not of both
+    assert by_key["ref5"]["cells"]["run"]["error"] == 100.0  # refused there, whoever reads
+    assert sum(value["wrong"] for value in true["by_source"].values()) == 2.0
+
+
+def test_recognisers_of_all_folds_and_seeds_are_asked_for(tmp_path, monkeypatch):
+    asked = []
+
+    def train(path, arguments):
+        asked.append(arguments)
+        save_recogniser(Recogniser(("run",)), path)
+
+    monkeypatch.setattr(recognisers, "_train", train)
+    first, second = synthetic_sequences(1, 60)[:2]
+    sequences = [replace(first, subject="a"), replace(second, subject="b", fold=1)]
+    readers = recognisers.readers_of(sequences, "clips.npz", False, tmp_path, seeds=2)
+    assert set(readers) == {(views, fold, seed) for views in ("3d", "2d") for fold in (0, 1) for seed in (0, 1)}
+    assert len({reader.path for reader in readers.values()}) == 8
+    assert len(asked) == 8
+    for arguments in asked:
+        fold = 1 if "fold1" in arguments[arguments.index("--out") + 1] else 0
+        assert arguments[arguments.index("--exclude") + 1] == "ab"[fold]
+        assert ("--seed" in arguments) == ("seed1" in arguments[arguments.index("--out") + 1])

@@ -165,6 +165,15 @@ def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Fil
     return film_of(body, motion, label, points, None, g)
 
 
+def held_out_film(seed: int, clips: list[MocapClip], points: int, turn: float) -> Film:
+    """Clip number ``seed % len(clips)`` on a random body before a camera that turns by ``turn`` degrees."""
+    g = torch.Generator().manual_seed(seed)
+    clip = clips[seed % len(clips)]
+    body = sample_body(g)
+    motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
+    return film_of(body, motion, MOCAP_CLASSES.index(clip.label), points, turn, g)
+
+
 def make_films(make: Callable[[int], Film], seeds: range, workers: int) -> Iterator[Film]:
     """``make`` of each seed, in order."""
     with ProcessPoolExecutor(max(1, workers), initializer=torch.set_num_threads, initargs=(1,)) as pool:
@@ -320,10 +329,14 @@ class Draws(Sampler[tuple[int, int]]):
     def __init__(self, films: list[Film]) -> None:
         labels = torch.tensor([film.label for film in films])
         self.odds = 1.0 / torch.bincount(labels)[labels]
-        self.epoch = 0
+        self.epoch = self.first = 0
+
+    def begin(self, epoch: int) -> None:
+        """Draw no epoch before this one: the trainer of a resumed run asks for films before it sets the epoch."""
+        self.epoch = self.first = epoch
 
     def set_epoch(self, epoch: int) -> None:
-        self.epoch = epoch
+        self.epoch = max(epoch, self.first)
 
     def __len__(self) -> int:
         return len(self.odds)

@@ -7,6 +7,8 @@ import json
 import shlex
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +62,29 @@ def rank(options: argparse.Namespace) -> None:
 
 def track(options: argparse.Namespace) -> None:
     """``torchrecon track``."""
-    from torchrecon.pipeline.video import track_video
+    if options.pose is not None:
+        tracks = _joints(options)
+    elif options.person is not None:
+        raise ReconError("--person: tells people apart whose joints are found; it needs --pose")
+    else:
+        from torchrecon.pipeline.video import track_video
 
-    tracks = track_video(options.video, options.masks, options.depth, options.camera, _config(options), progress=True)
+        config = _config(options)
+        tracks = track_video(options.video, options.masks, options.depth, options.camera, config, progress=True)
     path = tracks.save(options.out)
     _say(options, {"tracks": tracks.points, "frames": tracks.frames, "out": str(path)})
+
+
+def _joints(options: argparse.Namespace) -> Tracks:
+    from torchrecon.io.readers import ReadOptions
+    from torchrecon.pipeline.pose import track_pose
+
+    for name in ("masks", "depth", "config"):
+        if getattr(options, name) is not None:
+            raise ReconError(f"--{name}: is of no use with --pose, which finds people by itself; leave one of them out")
+    asked = ReadOptions(person=options.person)
+    with _said_on_stderr():
+        return track_pose(options.video, options.pose, options.camera, asked, options.device, progress=True)
 
 
 def reconstruct(options: argparse.Namespace) -> None:
@@ -167,12 +187,19 @@ def _load(options: argparse.Namespace) -> Tracks:
     from torchrecon.io.tracks import load_tracks
 
     size = None if options.image_size is None else tuple(options.image_size)
+    with _said_on_stderr():
+        tracks = load_tracks(options.tracks, person=options.person, view=options.view, image_size=size, fps=options.fps)
+    return tracks.to(options.device)
+
+
+@contextmanager
+def _said_on_stderr() -> Iterator[None]:
+    """Warnings as sentences, once the work is done."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        tracks = load_tracks(options.tracks, person=options.person, view=options.view, image_size=size, fps=options.fps)
+        yield
     for warning in said:
         print(f"warning: {warning.message}", file=sys.stderr)
-    return tracks.to(options.device)
 
 
 def _config(options: argparse.Namespace) -> Any:

@@ -33,6 +33,7 @@ EXTRAS: dict[str, tuple[tuple[str, ...], str]] = {
     "io": (("ezc3d", "h5py"), "writes C3D marker files, reads DeepLabCut and SLEAP H5 files"),
     "viz": (("matplotlib",), "draws views.png beside a reconstruction, and figures"),
     "rerun": (("rerun-sdk",), "exports .rrd recordings for the Rerun viewer"),
+    "pose": (("rtmlib", "onnxruntime"), "finds joints in a video: track --pose rtmlib (weights apart)"),
     "train": (("jsonargparse",), "trains the recogniser from the command line"),
 }
 

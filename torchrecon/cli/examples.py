@@ -24,6 +24,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "track": (
         ("torchrecon track clip.mp4 -o tracks.npz", "the mover is found in the clip"),
         ("torchrecon track frames/ -o tracks.npz --masks masks/", "a folder of images, masks of the person"),
+        ("torchrecon track clip.mp4 -o joints.npz --pose rtmlib", "17 joints, where rtmlib and its weights are"),
     ),
     "reconstruct": (
         ("torchrecon reconstruct clip.mp4 -o out/", "tracks, reconstruction and report in out/"),

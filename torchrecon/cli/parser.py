@@ -37,6 +37,8 @@ def build_parser() -> argparse.ArgumentParser:
     track = _command(commands, "track", "video to tracks with covariance and visibility")
     _video(track)
     track.add_argument("-o", "--out", required=True, metavar="TRACKS.npz", help="replaced atomically")
+    track.add_argument("--pose", choices=["rtmlib"], help="joints by a pose estimator instead of points on the skin")
+    track.add_argument("--person", type=int, metavar="N", help="with --pose: which person (default: 0)")
 
     reconstruct = _command(commands, "reconstruct", "video to tracks, reconstruction and report")
     _video(reconstruct)

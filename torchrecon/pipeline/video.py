@@ -7,6 +7,7 @@ import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -101,8 +102,9 @@ def reconstruct_video(
     """Everything from a clip to 3D, written to a folder.
 
     The folder holds ``run.json`` (what was run), ``tracks.npz``, ``reconstruction.npz``, ``views.png`` (front, side
-    and top view at three frames), ``report.json`` and ``report.html`` (all of it to look at, in one file). Tracks of
-    the same run are taken from the folder again, so a run that was interrupted after tracking goes on from there.
+    and top view at three frames; only where matplotlib is installed), ``report.json`` and ``report.html`` (all of it
+    to look at, in one file). Tracks of the same run are taken from the folder again, so a run that was interrupted
+    after tracking goes on from there.
 
     Raises:
         ReconError: as :func:`track_video`; a folder that holds another run's results, without ``force``.
@@ -140,7 +142,8 @@ def reconstruct_video(
             "median_track_length": tracks.visible.sum(-2).double().median(),
         },
     )
-    draw_views(answer, folder / "views.png")
+    if find_spec("matplotlib") is not None:  # an extra; the page shows the same and more
+        draw_views(answer, folder / "views.png")
     write_report(
         answer,
         folder / "report.html",

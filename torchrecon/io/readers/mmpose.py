@@ -16,7 +16,7 @@ from torchrecon.io.readers.people import Detection, choose, follow
 from torchrecon.io.readers.source import Floats, Source, numbers
 from torchrecon.measurement import Tracks
 
-__all__ = ["MMPOSE", "read_mmpose"]
+__all__ = ["MMPOSE", "bodies", "layout_of", "read_mmpose"]
 
 _SCORES = ("keypoint_scores", "scores", "keypoints_scores")
 
@@ -48,8 +48,12 @@ def _sniff(source: Source) -> bool:
     )
 
 
-def _bodies(source: Source, xy: Floats, scores: Floats, what: str) -> list[Detection]:
-    """(points, 2) or (people, points, 2), and scores of the shape before the last axis."""
+def bodies(source: Source, xy: Floats, scores: Floats, what: str) -> list[Detection]:
+    """The people of a frame: (points, 2) or (people, points, 2), and scores of the shape before the last axis.
+
+    Raises:
+        ReconError: shapes that do not fit; ``what`` says where.
+    """
     if xy.ndim == 2:
         xy = xy[None]
     if scores.ndim == 3 and scores.shape[-1] == 1:
@@ -69,7 +73,7 @@ def _instance(source: Source, value: Any, what: str) -> list[Detection]:
     scores = next(value[key] for key in _SCORES if key in value)
     if not value["keypoints"]:
         return []
-    return _bodies(source, numbers(source, value["keypoints"], what), numbers(source, scores, f"{what} scores"), what)
+    return bodies(source, numbers(source, value["keypoints"], what), numbers(source, scores, f"{what} scores"), what)
 
 
 def _from_json(source: Source) -> tuple[list[int], list[list[Detection]], Layout | None]:
@@ -86,6 +90,16 @@ def _from_json(source: Source) -> tuple[list[int], list[list[Detection]], Layout
         numbered.append(number)
         found.append([d for i, v in enumerate(instances) for d in _instance(source, v, f"frame {index}, person {i}")])
     return numbered, found, _named(content)
+
+
+def layout_of(points: int) -> Layout | None:
+    """Seventeen points are taken as COCO's and sixteen as MPII's.
+
+    Example:
+        >>> layout_of(17).names[0], layout_of(5)
+        ('nose', None)
+    """
+    return next((known for known in (COCO_17, MPII_16) if len(known.names) == points), None)
 
 
 def _named(content: Any) -> Layout | None:
@@ -113,7 +127,7 @@ def _from_arrays(source: Source) -> tuple[list[int], list[list[Detection]], None
         raise source.error(
             f"keypoints {xy.shape} and scores {scores.shape}; (frames, [people,] points, 2) and the same without the 2"
         )
-    found = [_bodies(source, body, score, f"frame {i}") for i, (body, score) in enumerate(zip(xy, scores, strict=True))]
+    found = [bodies(source, body, score, f"frame {i}") for i, (body, score) in enumerate(zip(xy, scores, strict=True))]
     return list(range(len(xy))), found, None
 
 
@@ -129,12 +143,10 @@ def read_mmpose(source: Source, options: ReadOptions | None = None) -> Tracks:
     numbered, found, layout = _from_arrays(source) if source.kind == "npz" else _from_json(source)
     places, count = frame_numbers(source, numbered)
     frames: dict[int, list[Detection]] = {}
-    for frame, bodies in zip(places, found, strict=True):
-        frames.setdefault(frame, []).extend(bodies)
+    for frame, people in zip(places, found, strict=True):
+        frames.setdefault(frame, []).extend(people)
     xy, confidence = choose(source, options, follow(source, frames)).arrays(source, count)
-    if layout is None:
-        layout = next((known for known in (COCO_17, MPII_16) if len(known.names) == xy.shape[1]), None)
-    return build(source, options, xy, np.asarray(confidence), layout=layout)
+    return build(source, options, xy, np.asarray(confidence), layout=layout or layout_of(xy.shape[1]))
 
 
 MMPOSE = Format("MMPose or rtmlib", _sniff, read_mmpose)
