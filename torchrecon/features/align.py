@@ -115,6 +115,7 @@ class Templates:
         weights: (points, samples) window times object mask.
         steepest: (points, samples, 12) change of the values with the warp (row by row, units of ``half``), x and y.
         pull: (points, 12, samples) least-squares map from a residual to a step.
+        unbend: (points, 12, 6) what the step gains where the window is bent already: the prior pulls it straight.
         slide: (points, 2, samples) the same for a window that keeps its shape.
         structure: (points, 2, 2) sum of w g g^T over the window, grey values per pixel squared.
         structure2: (points, 2, 2) sum of w^2 g g^T.
@@ -125,6 +126,7 @@ class Templates:
     weights: Tensor
     steepest: Tensor
     pull: Tensor
+    unbend: Tensor
     slide: Tensor
     structure: Tensor
     structure2: Tensor
@@ -167,6 +169,7 @@ def make_templates(
     weights: Float[Tensor, "points samples"] | None = None,
     deformation_damping: float = 0.02,
     bending_damping: float = 0.02,
+    stiffness: float = 2.0,
 ) -> Templates:
     """Cut templates around points.
 
@@ -178,6 +181,9 @@ def make_templates(
         deformation_damping: damping of the four affine parameters in a step, as a fraction of the strongest
             direction; keeps a window of little texture from shearing at will.
         bending_damping: the same of the six second-order parameters.
+        stiffness: prior that holds a window straight: what a bend of one pixel at its edge costs, in squared
+            standard deviations of the template summed over the window. Where the texture does not show a bend, noise
+            would make one, and the centre shifts with it.
     """
     window = window_weights(half, xy)
     weight = window.expand(len(xy), -1).clone() if weights is None else window * weights
@@ -193,7 +199,9 @@ def make_templates(
     strongest = hessian.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(_TINY)
     row = [deformation_damping] * 2 + [bending_damping] * 3
     damping = hessian.new_tensor(row * 2 + [1e-4] * 2)
-    pull = torch.linalg.inv(hessian + torch.diag_embed(strongest[:, None] * damping)) @ weighted.mT
+    straight = hessian.new_tensor(([0.0] * 2 + [stiffness] * 3) * 2 + [0.0] * 2)
+    inverse = torch.linalg.inv(hessian + torch.diag_embed(strongest[:, None] * damping + straight))
+    pull, unbend = inverse @ weighted.mT, stiffness * inverse[..., [2, 3, 4, 7, 8, 9]]
     shift = hessian[:, 10:, 10:] + 1e-3 * strongest[:, None, None] * torch.eye(2, dtype=xy.dtype, device=xy.device)
     slide = torch.linalg.inv(shift) @ weighted.mT[:, 10:]
     outer = gradient[..., :, None] * gradient[..., None, :]
@@ -202,6 +210,7 @@ def make_templates(
         weights=weight,
         steepest=steepest,
         pull=pull,
+        unbend=unbend,
         slide=slide,
         structure=(weight[..., None, None] * outer).sum(1),
         structure2=((weight**2)[..., None, None] * outer).sum(1),
@@ -253,7 +262,9 @@ def align_window(
             step = (templates.slide @ residual()[1][..., None])[..., 0].clamp(-half / 2, half / 2)
             centre = centre - (affine @ step[..., None])[..., 0]
             continue
-        step = (templates.pull @ residual()[1][..., None])[..., 0].clamp(-half / 2, half / 2)
+        back = torch.linalg.solve(affine, bent).flatten(-2) * half  # the step that would straighten the window
+        step = templates.pull @ residual()[1][..., None] + templates.unbend @ back[..., None]
+        step = step[..., 0].clamp(-half / 2, half / 2)
         change = step[:, :10].reshape(-1, 2, 5) / half
         increment = change[..., :2] + eye
         # W o W(step)^-1: the step moves the template, so its inverse moves the image window

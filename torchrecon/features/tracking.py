@@ -57,7 +57,8 @@ class TrackerParams:
         misfit: share of a window's contrast that no warp explains; lower limit of the noise in the covariance.
         bend: deviation that the bent surface adds to the covariance, in half widths of the window per unit of stretch.
         shading_sigma: pixels; grey values are matched after their local mean over this range is taken out; 0 = not.
-        depth_jump: metres; a step of depth near a point that counts as an edge (where depth is given).
+        depth_jump: metres; a step of depth near a point that counts as an edge (where depth is given); nearer than a
+            metre it decides, farther away the 3 % of :func:`depth_edges`.
         sift: detection parameters.
     """
 
@@ -66,7 +67,7 @@ class TrackerParams:
     levels: int = 3
     iterations: int = 6
     alpha: float = 0.8
-    detect_every: int = 2
+    detect_every: int = 1
     max_tracks: int = 400
     min_distance: float = 4.0
     min_length: int = 5
@@ -86,7 +87,7 @@ class TrackerParams:
     misfit: float = 0.2
     bend: float = 0.15
     shading_sigma: float = 5.0
-    depth_jump: float = 0.08
+    depth_jump: float = 0.03
     sift: SiftParams = field(default_factory=lambda: SiftParams(contrast=0.004))
 
     def __post_init__(self) -> None:
