@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from torchrecon.errors import ReconError
+from torchrecon.features.extrema import scale_space_extrema
 from torchrecon.features.matching import match_descriptors
 from torchrecon.features.sift import (
     SiftParams,
@@ -151,6 +152,23 @@ def test_keypoints_agree_with_opencv():
     assert len(theirs) > 50
     nearest = np.linalg.norm(theirs[:, None] - ours[None], axis=-1).min(1)
     assert (nearest < 1.5).mean() >= 0.8
+
+
+def test_sparse_extrema_are_those_of_kornias_detector():
+    # Kornia refines every extremum and drops none; the sparse detector never looks at the weak ones.
+    from kornia.feature import SIFTFeatureScaleSpace, get_laf_scale
+
+    image = _texture(160, 200, seed=3).float()
+    lafs, responses = SIFTFeatureScaleSpace(5000, descriptor_backend="pyramid").detector(image[None, None])
+    strong = responses[0] >= 0.01
+    expected = torch.cat([lafs[0, strong, :, 2], get_laf_scale(lafs)[0, strong, 0] / 6], -1).double()
+    xy, sigma, response = scale_space_extrema(image, 0.01)
+    found = torch.cat([xy, sigma[:, None]], -1).double()
+    distance = torch.cdist(found, expected)
+    assert len(found) == len(expected) > 50
+    assert distance.amin(1).max() < 0.01
+    assert distance.amin(0).max() < 0.01
+    assert bool((response[:-1] >= response[1:]).all())
 
 
 def test_edges_and_weak_extrema_are_rejected():

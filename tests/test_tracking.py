@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from torchrecon.errors import ReconError
 from torchrecon.features import TrackerParams, track_points
-from torchrecon.features.align import align_affine, align_translation, make_templates, search_translation
+from torchrecon.features.align import align_window, identity_warp, make_templates, search_translation
 from torchrecon.features.following import match_covariance
 from torchrecon.features.patches import image_pyramid
 from torchrecon.features.region import cut_region
@@ -190,15 +190,44 @@ def test_alignment_recovers_translation_and_affine_deformation():
     other = _sample(image, torch.cat([inverse, -(inverse @ t)[:, None]], 1), (120, 140))
     xy = torch.tensor([[50.0, 60.0], [80.0, 70.0], [60.0, 40.0]])
     truth = xy @ a.T + t
-    first, second = image_pyramid(image, 3), image_pyramid(other, 3)
-    moved, score = align_translation(first, second, xy, xy + (truth - xy) * 0.4, 7)
-    assert float((moved - truth).norm(dim=-1).max()) < 0.7
-    assert float(score.min()) > 0.8
-    eye = torch.eye(2).expand(3, 2, 2)
-    refined, deform, score, _ = align_affine(make_templates(first[0], xy, 7), second[0], moved, eye, 7, 25)
+    first, second = image_pyramid(image, 1)[0], image_pyramid(other, 1)[0]
+    templates, eye = make_templates(first, xy, 7), identity_warp(3, xy)
+    slid, kept, _, _ = align_window(templates, second, xy + (truth - xy) * 0.6, eye, 7, 10, deforms=False)
+    assert float((slid - truth).norm(dim=-1).max()) < 0.7
+    assert torch.equal(kept, eye)
+    refined, warp, score, _ = align_window(templates, second, slid, eye, 7, 25)
     assert float((refined - truth).norm(dim=-1).max()) < 0.05
-    assert float((deform - a).abs().max()) < 0.05
+    assert float((warp[..., :2] - a).abs().max()) < 0.05
     assert float(score.min()) > 0.99
+
+
+def test_window_on_a_turning_cylinder_keeps_its_centre():
+    """Closed form: a point at angle p of a cylinder of radius R is seen at R sin(p), turned by t at R sin(p + t)."""
+    radius, turn = 24.0, math.radians(25.0)
+    texture = _texture(260, 400, seed=21)
+    y, x = torch.meshgrid(torch.arange(80.0), torch.arange(81.0) - 40.0, indexing="ij")
+
+    def seen(angle: float) -> torch.Tensor:
+        phi = torch.asin((x / radius).clamp(-0.999, 0.999)) - angle
+        points = torch.stack([200.0 + radius * phi, 90.0 + y], -1)
+        limit = torch.tensor([texture.shape[1] - 1.0, texture.shape[0] - 1.0])
+        grid = (2 * points / limit - 1)[None]
+        return F.grid_sample(texture[None, None], grid, mode="bicubic", align_corners=True)[0, 0]
+
+    phi = torch.linspace(-0.35, 0.1, 10).repeat(4)
+    row = torch.tensor([20.0, 33.0, 46.0, 59.0]).repeat_interleave(10)
+    xy = torch.stack([40.0 + radius * torch.sin(phi), row], -1)
+    truth = torch.stack([40.0 + radius * torch.sin(phi + turn), row], -1)
+    stiffness = {"free": 0.0, "default": 2.0, "flat": 1e6}
+    errors = {}
+    for name, value in stiffness.items():
+        templates = make_templates(seen(0.0), xy, 6, stiffness=value)
+        position, warp = xy, identity_warp(len(xy), xy)
+        for step in range(1, 11):
+            position, warp, _, _ = align_window(templates, seen(turn * step / 10), position, warp, 6)
+        errors[name] = float((position - truth).norm(dim=-1).median())
+    assert errors["free"] < 0.6 * errors["flat"]
+    assert errors["free"] < errors["default"] < 0.9 * errors["flat"]
 
 
 def test_exhaustive_search_finds_a_shift_that_gradient_steps_miss():
@@ -208,7 +237,7 @@ def test_exhaustive_search_finds_a_shift_that_gradient_steps_miss():
     xy = torch.tensor([[50.0, 60.0], [80.0, 70.0], [60.0, 50.0]])
     found = search_translation(0.5 * image + 0.2, other, xy, xy, 5, 16)
     assert torch.equal(found, xy + shift)
-    stepped, _ = align_translation([image], [other], xy, xy, 5)
+    stepped = align_window(make_templates(image, xy, 5), other, xy, identity_warp(3, xy), 5, deforms=False)[0]
     assert float((stepped - xy - shift).norm(dim=-1).max()) > 2.0
     # Samples that belong to something else do not decide: the right half of the window is covered.
     covered = other.clone()
@@ -244,9 +273,8 @@ def test_match_covariance_predicts_the_scatter_of_matches(generator):
     for _ in range(trials):
         first = image_pyramid(image + noise * torch.randn(80, 80, generator=generator), 1, sigma=0.0)
         second = image_pyramid(image + noise * torch.randn(80, 80, generator=generator), 1, sigma=0.0)
-        moved, _ = align_translation(first, second, xy, xy, half)
-        templates = make_templates(first[0], xy, half, deformation_damping=1e6)
-        found, _, _, residual = align_affine(templates, second[0], moved, torch.eye(2)[None], half, 8)
+        templates = make_templates(first[0], xy, half, deformation_damping=1e6, bending_damping=1e6)
+        found, _, _, residual = align_window(templates, second[0], xy, identity_warp(1, xy), half, 8)
         spread.append(found[0] - xy[0])
         predicted.append(match_covariance(templates, residual, half)[0])
     measured = torch.cov(torch.stack(spread).T)

@@ -1,5 +1,4 @@
-"""Sub-pixel alignment of patches by Gauss-Newton, batched over points: translation from frame to frame, affine
-against a stored template, and the covariance of the position that results.
+"""Sub-pixel alignment of patches with stored templates by Gauss-Newton, batched over points, and an exhaustive search.
 
 Both are insensitive to gain and offset of the grey values: patches are compared after subtracting their weighted
 mean and dividing by their weighted standard deviation.
@@ -15,7 +14,14 @@ import torch.nn.functional as F
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.features.patches import patch_grid, sample_image
 
-__all__ = ["Templates", "align_affine", "align_translation", "make_templates", "search_translation", "window_weights"]
+__all__ = [
+    "Templates",
+    "align_window",
+    "identity_warp",
+    "make_templates",
+    "search_translation",
+    "window_weights",
+]
 
 _TINY = 1e-6  # grey-value scale below which a patch counts as flat; 8-bit steps are 4e-3
 
@@ -52,58 +58,6 @@ def _project_out(steepest: Tensor, template: Tensor, weights: Tensor) -> Tensor:
     return steepest - along[:, None] * template[..., None]
 
 
-def align_translation(
-    source: list[Tensor],
-    target: list[Tensor],
-    xy: Float[Tensor, "points 2"],
-    guess: Float[Tensor, "points 2"],
-    half: int,
-    iterations: int = 6,
-    weights: list[Tensor] | None = None,
-) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:
-    """Find the patches around ``xy`` of one pyramid in another, coarse to fine, by translation alone.
-
-    Args:
-        source: pyramid of the frame in which the points are known.
-        target: pyramid of the frame in which they are looked for.
-        xy: positions in ``source``, pixels of level 0.
-        guess: where to start in ``target``.
-        half: half width of the window in pixels of each level.
-        iterations: Gauss-Newton steps per level.
-        weights: per level (points, samples) in [0, 1], which samples belong to the object; default all.
-
-    Returns:
-        position in ``target``; correlation (-1..1) of the two windows there.
-
-    Source: Lucas and Kanade, IJCAI 1981; inverse compositional form of Baker and Matthews, IJCV 2004.
-    """
-    window = window_weights(half, xy)
-    position = guess.clone()
-    score = xy.new_zeros(len(xy))
-    for level in reversed(range(len(source))):
-        scale = 2.0**-level
-        weight = window.expand(len(xy), -1) if weights is None else window * weights[level]
-        patch, gradient = _patch_with_gradient(source[level], xy * scale, half)
-        template, deviation = _standardise(patch, weight)
-        steepest = _project_out(gradient / deviation[:, None, None], template, weight)
-        weighted = steepest * weight[..., None]
-        hessian = weighted.mT @ steepest
-        damping = 1e-3 * hessian.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(_TINY)
-        inverse = torch.linalg.inv(hessian + damping[:, None, None] * torch.eye(2, dtype=xy.dtype, device=xy.device))
-        pull = inverse @ weighted.mT
-        grid = patch_grid(half, xy)
-        centre = position * scale
-        for _ in range(iterations):
-            current, _ = _standardise(sample_image(target[level], centre[:, None] + grid), weight)
-            step = (pull @ (current - template)[..., None])[..., 0]
-            centre = centre - step.clamp(-half / 2, half / 2)
-        position = centre / scale
-        if level == 0:
-            current, _ = _standardise(sample_image(target[0], centre[:, None] + grid), weight)
-            score = (weight * current * template).sum(-1) / weight.sum(-1).clamp_min(_TINY)
-    return position, score
-
-
 def search_translation(
     source: Float[Tensor, "height width"],
     target: Float[Tensor, "rows columns"],
@@ -115,7 +69,7 @@ def search_translation(
 ) -> Float[Tensor, "points 2"]:
     """Where in ``target`` the patches around ``xy`` of ``source`` fit best, by trying every whole-pixel shift.
 
-    Slower than :func:`align_translation`, but it needs no start inside the basin of attraction: for points whose
+    Slower than steps along the gradient, but it needs no start inside their basin of attraction: for points whose
     motion is not known yet and for those that were lost.
 
     Args:
@@ -159,8 +113,10 @@ class Templates:
     Attributes:
         values: (points, samples) standardised grey values.
         weights: (points, samples) window times object mask.
-        steepest: (points, samples, 6) change of the values with (A11, A12, A21, A22, x, y), A in units of ``half``.
-        pull: (points, 6, samples) least-squares map from a residual to a step.
+        steepest: (points, samples, 12) change of the values with the warp (row by row, units of ``half``), x and y.
+        pull: (points, 12, samples) least-squares map from a residual to a step.
+        unbend: (points, 12, 6) what the step gains where the window is bent already: the prior pulls it straight.
+        slide: (points, 2, samples) the same for a window that keeps its shape.
         structure: (points, 2, 2) sum of w g g^T over the window, grey values per pixel squared.
         structure2: (points, 2, 2) sum of w^2 g g^T.
         deviation: (points,) grey-value standard deviation of the window.
@@ -170,6 +126,8 @@ class Templates:
     weights: Tensor
     steepest: Tensor
     pull: Tensor
+    unbend: Tensor
+    slide: Tensor
     structure: Tensor
     structure2: Tensor
     deviation: Tensor
@@ -193,12 +151,25 @@ class Templates:
         return Templates(*parts)
 
 
+def _monomials(half: int, like: Tensor) -> Float[Tensor, "samples 5"]:
+    """x, y, x^2, x y, y^2 of a patch's offsets, pixels; the squares in units of ``half`` so that all are alike."""
+    x, y = patch_grid(half, like).unbind(-1)
+    return torch.stack([x, y, x * x / half, x * y / half, y * y / half], -1)
+
+
+def identity_warp(count: int, like: Tensor) -> Float[Tensor, "points 2 5"]:
+    """Warps that leave windows as they are."""
+    return torch.eye(2, 5, dtype=like.dtype, device=like.device).repeat(count, 1, 1)
+
+
 def make_templates(
     image: Float[Tensor, "height width"],
     xy: Float[Tensor, "points 2"],
     half: int,
     weights: Float[Tensor, "points samples"] | None = None,
     deformation_damping: float = 0.02,
+    bending_damping: float = 0.02,
+    stiffness: float = 2.0,
 ) -> Templates:
     """Cut templates around points.
 
@@ -209,73 +180,103 @@ def make_templates(
         weights: which samples belong to the object, in [0, 1]; default all.
         deformation_damping: damping of the four affine parameters in a step, as a fraction of the strongest
             direction; keeps a window of little texture from shearing at will.
+        bending_damping: the same of the six second-order parameters.
+        stiffness: prior that holds a window straight: what a bend of one pixel at its edge costs, in squared
+            standard deviations of the template summed over the window. Where the texture does not show a bend, noise
+            would make one, and the centre shifts with it.
     """
     window = window_weights(half, xy)
     weight = window.expand(len(xy), -1).clone() if weights is None else window * weights
     patch, gradient = _patch_with_gradient(image, xy, half)
     values, deviation = _standardise(patch, weight)
-    offset = patch_grid(half, xy) / half
-    gx, gy = gradient[..., 0] / deviation[:, None], gradient[..., 1] / deviation[:, None]
-    columns = [gx * offset[:, 0], gx * offset[:, 1], gy * offset[:, 0], gy * offset[:, 1], gx, gy]
-    steepest = _project_out(torch.stack(columns, -1), values, weight)
+    offset = _monomials(half, xy) / half
+    gradient = gradient / deviation[:, None, None]
+    columns = (gradient[..., :, None] * offset[:, None]).flatten(-2)  # the x row of the warp, then the y row
+    steepest = _project_out(torch.cat([columns, gradient], -1), values, weight)
+    gradient = gradient * deviation[:, None, None]
     weighted = steepest * weight[..., None]
     hessian = weighted.mT @ steepest
     strongest = hessian.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(_TINY)
-    damping = hessian.new_tensor([deformation_damping] * 4 + [1e-4] * 2)
-    pull = torch.linalg.inv(hessian + torch.diag_embed(strongest[:, None] * damping)) @ weighted.mT
+    row = [deformation_damping] * 2 + [bending_damping] * 3
+    damping = hessian.new_tensor(row * 2 + [1e-4] * 2)
+    straight = hessian.new_tensor(([0.0] * 2 + [stiffness] * 3) * 2 + [0.0] * 2)
+    inverse = torch.linalg.inv(hessian + torch.diag_embed(strongest[:, None] * damping + straight))
+    pull, unbend = inverse @ weighted.mT, stiffness * inverse[..., [2, 3, 4, 7, 8, 9]]
+    shift = hessian[:, 10:, 10:] + 1e-3 * strongest[:, None, None] * torch.eye(2, dtype=xy.dtype, device=xy.device)
+    slide = torch.linalg.inv(shift) @ weighted.mT[:, 10:]
     outer = gradient[..., :, None] * gradient[..., None, :]
     return Templates(
         values=values,
         weights=weight,
         steepest=steepest,
         pull=pull,
+        unbend=unbend,
+        slide=slide,
         structure=(weight[..., None, None] * outer).sum(1),
         structure2=((weight**2)[..., None, None] * outer).sum(1),
         deviation=deviation,
     )
 
 
-def align_affine(
+def align_window(
     templates: Templates,
     image: Float[Tensor, "height width"],
     xy: Float[Tensor, "points 2"],
-    affine: Float[Tensor, "points 2 2"],
+    warp: Float[Tensor, "points 2 5"],
     half: int,
     iterations: int = 6,
+    deforms: bool = True,
 ) -> tuple[
-    Float[Tensor, "points 2"], Float[Tensor, "points 2 2"], Float[Tensor, " points"], Float[Tensor, "points samples"]
+    Float[Tensor, "points 2"], Float[Tensor, "points 2 5"], Float[Tensor, " points"], Float[Tensor, "points samples"]
 ]:
-    """Refine position and affine deformation of templates in an image (inverse compositional Gauss-Newton).
+    """Refine position and deformation of templates in an image by Gauss-Newton.
+
+    The warp is affine with second-order terms: a window on a limb sees a bent surface, and an affine fit to what its
+    turn does to the window shifts the centre by more the further it has turned.
 
     Args:
         templates: from :func:`make_templates`, with the same ``half``.
         image: level 0 of the pyramid of the current frame.
         xy: where to start, pixels.
-        affine: template -> image deformation to start from.
+        warp: template -> image deformation to start from: factors of x, y, x^2, x y, y^2 (squares over ``half``).
         half: half width of the window, pixels.
         iterations: steps.
+        deforms: without it the warp stays as it is and only the position is refined.
 
     Returns:
-        position; affine; correlation (-1..1); residual in standard deviations of the template.
+        position; warp; correlation (-1..1); residual in standard deviations of the template.
+
+    Source: the inverse compositional form (Baker and Matthews, IJCV 2004) of Lucas and Kanade, IJCAI 1981.
     """
-    grid = patch_grid(half, xy)
-    centre, deform = xy.clone(), affine.clone()
-    for _ in range(iterations):
-        points = centre[:, None] + grid @ deform.mT
+    grid = _monomials(half, xy)
+    centre, affine, bent = xy.clone(), warp[..., :2], warp[..., 2:]
+
+    def residual() -> tuple[Tensor, Tensor]:
+        points = centre[:, None] + grid @ torch.cat([affine, bent], -1).mT
         current, _ = _standardise(sample_image(image, points), templates.weights)
-        step = (templates.pull @ (current - templates.values)[..., None])[..., 0].clamp(-half / 2, half / 2)
-        increment = step[:, :4].reshape(-1, 2, 2) / half
-        increment = increment + torch.eye(2, dtype=xy.dtype, device=xy.device)
+        return current, current - templates.values
+
+    eye = torch.eye(2, dtype=xy.dtype, device=xy.device)
+    for _ in range(iterations):
+        if not deforms:
+            step = (templates.slide @ residual()[1][..., None])[..., 0].clamp(-half / 2, half / 2)
+            centre = centre - (affine @ step[..., None])[..., 0]
+            continue
+        back = torch.linalg.solve(affine, bent).flatten(-2) * half  # the step that would straighten the window
+        step = templates.pull @ residual()[1][..., None] + templates.unbend @ back[..., None]
+        step = step[..., 0].clamp(-half / 2, half / 2)
+        change = step[:, :10].reshape(-1, 2, 5) / half
+        increment = change[..., :2] + eye
         # W o W(step)^-1: the step moves the template, so its inverse moves the image window
         determinant = increment[:, 0, 0] * increment[:, 1, 1] - increment[:, 0, 1] * increment[:, 1, 0]
         safe = torch.where(determinant.abs() < 0.1, torch.ones_like(determinant), determinant)
         adjugate = torch.stack(
             [increment[:, 1, 1], -increment[:, 0, 1], -increment[:, 1, 0], increment[:, 0, 0]], -1
         ).reshape(-1, 2, 2)
-        deform = deform @ (adjugate / safe[:, None, None])
-        centre = centre - (deform @ step[:, 4:, None])[..., 0]
-    points = centre[:, None] + grid @ deform.mT
-    current, _ = _standardise(sample_image(image, points), templates.weights)
+        bent = bent - affine @ change[..., 2:]  # to first order; exact where the steps end
+        affine = affine @ (adjugate / safe[:, None, None])
+        centre = centre - (affine @ step[:, 10:, None])[..., 0]
+    current, rest = residual()
     total = templates.weights.sum(-1).clamp_min(_TINY)
     score = (templates.weights * current * templates.values).sum(-1) / total
-    return centre, deform, score, current - templates.values
+    return centre, torch.cat([affine, bent], -1), score, rest

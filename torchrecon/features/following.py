@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from torchrecon._typing import Float, Tensor
-from torchrecon.features.align import Templates, align_affine, align_translation, make_templates, search_translation
+from torchrecon.features.align import Templates, align_window, identity_warp, make_templates, search_translation
+from torchrecon.features.klt import pair_of_images, there_and_back
 from torchrecon.features.region import Region
 from torchrecon.statespace import abg_gains, abg_predict, abg_update
 
@@ -27,7 +28,7 @@ class Alive:
         ids: (n,) number of the track.
         xy: (n, 2) pixels of the image.
         state: (n, 2, 3) alpha-beta-gamma state of x and y, per frame.
-        affine: (n, 2, 2) deformation from the template to the last frame.
+        warp: (n, 2, 5) deformation from the template to the last frame, see :func:`align_window`.
         templates: what the point looked like when its template was taken.
         anchor: (n, 2, 2) px^2, covariance of the position at which the template was taken.
         covariance: (n, 2, 2) px^2 of ``xy`` against the point first seen.
@@ -38,7 +39,7 @@ class Alive:
     ids: Tensor
     xy: Tensor
     state: Tensor
-    affine: Tensor
+    warp: Tensor
     templates: Templates
     anchor: Tensor
     covariance: Tensor
@@ -78,7 +79,7 @@ def born(region: Region, xy: Float[Tensor, "points 2"], first_id: int, half: int
         ids=torch.arange(first_id, first_id + count, device=xy.device),
         xy=xy,
         state=torch.stack([xy, velocity, torch.zeros_like(xy)], -1),
-        affine=_identity(count, xy).clone(),
+        warp=identity_warp(count, xy),
         templates=make_templates(region.pyramid[0], here, half, _fine_weights(region, here, half)),
         anchor=torch.zeros(count, 2, 2).to(xy),
         covariance=torch.full((count, 2, 2), torch.nan).to(xy),
@@ -180,76 +181,82 @@ def _local_motion(
     return xy + fit[:, 0], rest.median(1).values / math.log(2.0)
 
 
-def _there_and_back(
-    last: Region, now: Region, start: Tensor, guess: Tensor, levels: int, params: TrackerParams
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Match by translation on the finest ``levels``: position, correlation, and pixels by which the way back misses."""
-    half = params.window
+def _search(alive: Alive, last: Region, now: Region, guess: Tensor, params: TrackerParams) -> tuple[Tensor, Tensor]:
+    """Where each point went from the last frame, pixels of the image, and whether it came back when followed back.
 
-    def match(source: Region, target: Region, xy: Tensor, begin: Tensor) -> tuple[Tensor, Tensor]:
-        weights = source.weights(xy, half)
-        weights = None if weights is None else weights[:levels]
-        pyramids = source.pyramid[:levels], target.pyramid[:levels]
-        return align_translation(*pyramids, xy, begin, half, params.iterations, weights)
+    From the prediction; where that fails from where the neighbours' motion puts it; where that fails too, from the
+    best whole-pixel shift. What fails all three is left where the neighbours put it, to be judged by its template.
+    """
+    images = pair_of_images(last, now)
+    moved, returned = there_and_back(images, alive.xy, guess, params.search_window, params.levels)
 
-    moved, score = match(last, now, start, guess)
-    back, _ = match(now, last, moved, moved + start - guess)
-    return moved, score, (back - start).norm(dim=-1)
+    def again(lost: Tensor, begin: Tensor, levels: int) -> Tensor:
+        second, missed = there_and_back(images, alive.xy[lost], begin, params.search_window, levels)
+        better = missed < params.max_backward
+        at = lost.nonzero()[better, 0]
+        moved[at], returned[at] = second[better], missed[better]
+        return returned >= params.max_backward
+
+    lost = returned >= params.max_backward
+    if lost.any() and int((~lost).sum()) >= 6:
+        even = _identity(len(moved), moved)
+        near, _ = _local_motion(alive.xy, moved, even, ~lost, 12, params.alike * now.size / 100.0)
+        moved[lost] = near[lost]
+        lost = again(lost, near[lost], max(1, params.levels - 1))
+    if lost.any():
+        start, begin, half = (alive.xy - last.origin)[lost], (moved - now.origin)[lost], params.window
+        weights = last.weights(start, half)
+        where = search_translation(
+            last.pyramid[1], now.pyramid[1], start / 2, begin / 2, half,
+            math.ceil(params.reach * now.size / 200.0), None if weights is None else weights[1],
+        )  # fmt: skip
+        lost = again(lost, 2 * where + now.origin, max(1, params.levels - 1))
+    return moved, ~lost
 
 
 def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> Alive:
     """Carry living tracks from the last frame into this one; tracks that fail a check are left out.
 
-    Match: translation from the last frame (coarse to fine, from the prediction; by trying every shift where that
-    fails), then affine against the track's own template, which does not drift. Where the template no longer fits but
-    the last frame does, the template is taken anew from the last frame and the error of the position there stays
-    with the track (``anchor``).
+    Match: search from the last frame (:func:`_search`), then affine against the track's own template, which does not
+    drift. Where the template no longer fits but the last frame does, the template is taken anew from the last frame
+    and the error of the position there stays with the track (``anchor``).
     """
     half, percent = params.window, now.size / 100.0
     predicted = abg_predict(alive.state, 1.0)
-    start, guess = alive.xy - last.origin, predicted[..., 0] - now.origin
-    levels = len(now.pyramid)
-    moved, step_score, returned = _there_and_back(last, now, start, guess, levels, params)
-
-    # A new point has no motion yet, and the search of a fast one may have ended beside it: try every shift.
-    lost = (alive.age == 0) | (step_score <= params.min_correlation) | (returned >= params.max_backward)
-    if levels > 1 and lost.any():
-        level = levels - 2
-        scale, weights = 2.0**-level, last.weights(start[lost], half)
-        where = search_translation(
-            last.pyramid[level], now.pyramid[level], start[lost] * scale, guess[lost] * scale, half,
-            math.ceil(params.reach * percent * scale), None if weights is None else weights[level],
-        )  # fmt: skip
-        second = _there_and_back(last, now, start[lost], where / scale, levels - 1, params)
-        failed = (returned[lost] >= params.max_backward) | (second[1] > step_score[lost])
-        better = failed & (second[2] < params.max_backward)
-        at = lost.nonzero()[better, 0]
-        for first, other in zip((moved, step_score, returned), second, strict=True):
-            first[at] = other[better]
+    start = alive.xy - last.origin
+    moved, found_back = _search(alive, last, now, predicted[..., 0], params)
+    moved = moved - now.origin
     image = now.pyramid[0]
-    xy, affine, score, residual = align_affine(alive.templates, image, moved, alive.affine, half, params.iterations)
+    xy, warp, score, residual = align_window(alive.templates, image, moved, alive.warp, half, params.iterations)
 
     def fits(position: Tensor, deform: Tensor, correlation: Tensor, least: float) -> Tensor:
         near = (position - moved).norm(dim=-1) < params.max_disagreement
-        return (correlation > least) & near & (_stretch(deform) < params.max_stretch)
+        return (correlation > least) & near & (_stretch(deform[..., :2]) < params.max_stretch)
 
-    stale = ~fits(xy, affine, score, params.renew_correlation)
+    stale = ~fits(xy, warp, score, params.renew_correlation) & found_back
     templates, anchor = alive.templates, alive.anchor
     if stale.any():
         here = start[stale]
         fresh = make_templates(last.pyramid[0], here, half, _fine_weights(last, here, half))
-        renewed = align_affine(fresh, image, moved[stale], _identity(len(here), xy), half, params.iterations)
+        start_at, whole = moved[stale], identity_warp(len(here), xy)
+        renewed = align_window(fresh, image, start_at, whole, half, params.iterations)
+        # A window of little texture may run away in its many parameters: from one frame to the next it can do without.
+        kept = align_window(fresh, image, start_at, whole, half, params.iterations, deforms=False)
+        away = (renewed[0] - start_at).norm(dim=-1) >= params.max_disagreement
+        away |= (renewed[2] <= params.renew_correlation) & (kept[2] >= renewed[2] - 0.1)
         templates = templates.replace_where(stale, fresh)
-        xy, affine, score, residual, anchor = (v.clone() for v in (xy, affine, score, residual, anchor))
-        xy[stale], affine[stale], score[stale], residual[stale] = renewed
+        xy, warp, score, residual, anchor = (v.clone() for v in (xy, warp, score, residual, anchor))
+        for first, second, target in zip(renewed, kept, (xy, warp, score, residual), strict=True):
+            target[stale] = torch.where(away.reshape(-1, *[1] * (first.ndim - 1)), second, first)
         anchor[stale] = torch.nan_to_num(alive.covariance[stale])
     match = match_covariance(templates, residual, half, params.misfit)
-    good = fits(xy, affine, score, params.min_correlation) & (step_score > params.min_correlation)
-    good &= (returned < params.max_backward) & torch.isfinite(xy).all(-1)
+    # A point that the search did not bring back may still be confirmed by its template, which knows it better.
+    good = fits(xy, warp, score, params.min_correlation) & torch.isfinite(xy).all(-1)
+    good &= found_back | (score > params.sure_correlation)
 
     # Along an edge or a stripe the window says little: there the neighbours' motion decides (Kalman update).
     expected, spread = _local_motion(start, xy, match, good, 12, params.alike * percent)
-    prior = torch.nan_to_num(alive.covariance) - alive.anchor - _bend(alive.affine, params.bend * half)
+    prior = torch.nan_to_num(alive.covariance) - alive.anchor - _bend(alive.warp[..., :2], params.bend * half)
     prior[stale] = 0.0
     prior = prior + (spread + (params.local_std * percent) ** 2)[:, None, None] * _identity(len(xy), xy)
     innovation = torch.linalg.inv(match + prior)
@@ -259,7 +266,7 @@ def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> A
     good &= odd.norm(dim=-1) < params.max_neighbour * percent
     xy = xy + (gain @ odd[..., None])[..., 0]
     match = match - gain @ match
-    covariance = anchor + (match + match.mT) / 2 + _bend(affine, params.bend * half)
+    covariance = anchor + (match + match.mT) / 2 + _bend(warp[..., :2], params.bend * half)
     good &= now.admits(xy) & (torch.linalg.eigvalsh(covariance)[:, -1] < (params.max_std * percent) ** 2)
 
     found = xy + now.origin
@@ -268,7 +275,7 @@ def advance(alive: Alive, last: Region, now: Region, params: TrackerParams) -> A
     begin = torch.stack([found, found - alive.xy, torch.zeros_like(found)], -1)
     state = torch.where((alive.age == 0)[:, None, None], begin, state)
     new = replace(
-        alive, xy=found, state=state, affine=affine, templates=templates, anchor=anchor, covariance=covariance,
+        alive, xy=found, state=state, warp=warp, templates=templates, anchor=anchor, covariance=covariance,
         age=alive.age + 1, score=score,
     )  # fmt: skip
     return new.select(good)

@@ -26,6 +26,8 @@ class Region:
         allowed: (h, w) where points may live.
         origin: (2,) x, y of the cut's first pixel in the image.
         size: of the object, pixels: square root of its area; without a mask a fifth of the frame's.
+        luma: (height, width) grey values of the whole frame.
+        brightness: () mean grey value of the object.
     """
 
     gray: Tensor
@@ -35,6 +37,13 @@ class Region:
     allowed: Tensor
     origin: Tensor
     size: float
+    luma: Tensor
+    brightness: Tensor
+
+    @property
+    def extent(self) -> Tensor:
+        """Width and height of the cut."""
+        return self.origin.new_tensor(self.gray.shape[::-1])
 
     def admits(self, xy: Float[Tensor, "points 2"]) -> Bool[Tensor, " points"]:
         """Whether the nearest pixel lies in the cut and points may live there; ``xy`` in the cut."""
@@ -161,7 +170,8 @@ def cut_region(
     if box is None:
         return None
     x0, y0, x1, y1 = box
-    gray = to_gray(frame[:, y0:y1, x0:x1])
+    luma = to_gray(frame)
+    gray = luma[y0:y1, x0:x1]
     inside = None
     allowed = births = torch.ones_like(gray, dtype=torch.bool)
     if mask is not None:
@@ -178,4 +188,5 @@ def cut_region(
     if shading_sigma > 0:
         pyramid[0] = remove_shading(pyramid[0], None if inside is None else inside[0], shading_sigma)
     area = height * width / 25.0 if mask is None else max(float(mask.sum()), 900.0)
-    return Region(gray, pyramid, inside, births, allowed, origin, math.sqrt(area))
+    brightness = (gray if mask is None or not mask.any() else gray[mask[y0:y1, x0:x1]]).mean().clamp_min(1e-3)
+    return Region(gray, pyramid, inside, births, allowed, origin, math.sqrt(area), luma, brightness)

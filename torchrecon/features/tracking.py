@@ -31,6 +31,7 @@ class TrackerParams:
 
     Attributes:
         window: half width of the matched window, pixels; 5 means 11 x 11.
+        search_window: half width of the window of the search from frame to frame, pixels of each pyramid level.
         levels: pyramid levels for the search from frame to frame; each doubles the reach.
         iterations: Gauss-Newton steps per level.
         alpha: position gain of the alpha-beta-gamma predictor, in (0, 1).
@@ -40,6 +41,7 @@ class TrackerParams:
         min_length: frames; shorter tracks are dropped from the result.
         mask_margin: pixels that a new point keeps from the mask's border.
         min_correlation: correlation of the window with its template below which a track ends.
+        sure_correlation: correlation above which a point is confirmed that the search from the last frame lost.
         renew_correlation: correlation below which the template is taken anew.
         max_stretch: factor by which a template may be stretched or shrunk before it is taken anew.
         max_disagreement: pixels between the match with the last frame and the match with the template.
@@ -55,24 +57,27 @@ class TrackerParams:
         misfit: share of a window's contrast that no warp explains; lower limit of the noise in the covariance.
         bend: deviation that the bent surface adds to the covariance, in half widths of the window per unit of stretch.
         shading_sigma: pixels; grey values are matched after their local mean over this range is taken out; 0 = not.
-        depth_jump: metres; a step of depth near a point that counts as an edge (where depth is given).
+        depth_jump: metres; a step of depth near a point that counts as an edge (where depth is given); nearer than a
+            metre it decides, farther away the 3 % of :func:`depth_edges`.
         sift: detection parameters.
     """
 
     window: int = 5
+    search_window: int = 7
     levels: int = 3
     iterations: int = 6
     alpha: float = 0.8
     detect_every: int = 1
     max_tracks: int = 400
-    min_distance: float = 3.0
+    min_distance: float = 4.0
     min_length: int = 5
     mask_margin: float = 2.0
     min_correlation: float = 0.7
+    sure_correlation: float = 0.85
     renew_correlation: float = 0.75
     max_stretch: float = 2.5
     max_disagreement: float = 2.0
-    max_backward: float = 0.7
+    max_backward: float = 1.0
     gate: float = 3.0
     max_neighbour: float = 0.75
     local_std: float = 0.25
@@ -82,11 +87,11 @@ class TrackerParams:
     misfit: float = 0.2
     bend: float = 0.15
     shading_sigma: float = 5.0
-    depth_jump: float = 0.08
+    depth_jump: float = 0.03
     sift: SiftParams = field(default_factory=lambda: SiftParams(contrast=0.004))
 
     def __post_init__(self) -> None:
-        for name in ("window", "levels", "iterations", "detect_every", "max_tracks", "min_length"):
+        for name in ("window", "search_window", "levels", "iterations", "detect_every", "max_tracks", "min_length"):
             if getattr(self, name) < 1:
                 raise ReconError(f"{name}: {getattr(self, name)} is not a positive whole number")
         if not 0 < self.alpha < 1:
@@ -172,7 +177,7 @@ def track_points(
         empty = frame.new_zeros(0, 2)
         around = empty if alive is None else abg_predict(alive.state, 1.0)[..., 0]
         region = cut_region(
-            frame, mask, depth, around, levels=params.levels, margin=4 * params.window,
+            frame, mask, depth, around, levels=2, margin=4 * params.window,
             birth_margin=params.mask_margin, depth_jump=params.depth_jump, edge_radius=params.window // 2,
             shading_sigma=params.shading_sigma,
         )  # fmt: skip
