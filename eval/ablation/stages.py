@@ -148,9 +148,10 @@ def measure_stages(persons: Sequence[Person], cache: Cache, workers: int) -> dic
 
 def stage_lines(found: Mapping[str, Any]) -> list[str]:
     """The result as text."""
+    gaps = f"{100 * found['missing']:.0f} % of the entries in gaps"
     lines = [
-        f"error3d_camera at seen entries, {len(found['persons'])} persons; true K {found['true']}, {found['snr']:g} dB,",
-        f"noise {found['anisotropy']:g} times as long as wide, {100 * found['missing']:.0f} % of the entries in gaps",
+        f"error3d_camera at seen entries, {len(found['persons'])} persons; true K {found['true']},",
+        f"{found['snr']:g} dB, noise {found['anisotropy']:g} times as long as wide, {gaps}",
         f"{'':<46}{'default':>10}{'em_ppca':>10}  K of each person",
     ]
     for row in found["variants"]:
