@@ -22,7 +22,7 @@ from torchrecon.errors import ReconError
 from torchrecon.metrics import error3d_camera
 from torchrecon.models.recogniser import Recogniser, classify_windows
 
-__all__ = ["ASSUMED", "SOLVERS", "TRUE", "bases_lines", "measure_bases"]
+__all__ = ["ASSUMED", "NEAR", "SOLVERS", "TRUE", "bases_lines", "measure_bases"]
 
 TRUE = 4
 ASSUMED = (2, 3, 4, 5, 6, 8)  # 0.5 to 2 times the true K
