@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace, out: Path) -> tuple[dict[str, Any], list[
     """Every part that was asked for: its numbers and their text."""
     small, seed = arguments.smoke, 100 * arguments.seed
     trials = 1 if small else arguments.trials
-    actions, size = (ACTIONS[:1], 40) if small else (ACTIONS, 60)
+    actions, size = (ACTIONS[:1], 30) if small else (ACTIONS, 60)
     persons = [Person(a, seed + 10 * i + t, size, size, TRUE) for i, a in enumerate(actions) for t in range(trials)]
     filming = Filming("depth", size=(216, 288) if small else (432, 576))
     films = synthetic_sequences(1, 12 if small else 40, arguments.seed)[: 1 if small else 4]
