@@ -13,12 +13,12 @@ import html
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from eval.claims import CLAIMS, judge
-from eval.job import ROOT, provenance, read_json, write_json, write_text
+from eval.job import ROOT, provenance, read_json, source_digest, write_json, write_text
 from torchrecon.errors import ReconError
 
 __all__ = ["Job", "jobs_of", "main", "page"]
@@ -33,37 +33,69 @@ _STYLE = (
 
 @dataclass(frozen=True)
 class Job:
-    """A job and the folder that it writes ``NAME.json``, ``NAME.txt`` and pictures into."""
+    """A job and the folder that it writes ``NAME.json``, ``NAME.txt`` and pictures into.
+
+    Attributes:
+        name, module, out: of its files, of its code, and its folder.
+        arguments: of its command line.
+        kept: it has no cache to go on from, so it is left out where its result comes from this very code.
+        small: it has a version that fits into the smoke run.
+        prints: it writes no text of its own; what it prints is kept.
+        takes: the options of all jobs that it knows.
+    """
 
     name: str
     module: str
     out: Path
     arguments: tuple[str, ...] = ()
+    kept: bool = False
+    small: bool = True
+    prints: bool = False
+    takes: tuple[str, ...] = ("seed", "smoke", "fresh")
 
 
 def jobs_of(root: Path, regime: str, smoke: bool) -> list[Job]:
     """Everything that the page shows, cheapest answers first where order does not matter.
 
     Example:
-        >>> [job.name for job in jobs_of(Path("runs"), "turning", smoke=False)]
-        ['table2', 'table3', 'table4', 'table5', 'figures', 'table1']
+        >>> [job.name for job in jobs_of(Path("runs"), "turning", smoke=True)]
+        ['table2', 'table3', 'table4', 'table5', 'figures', 'ablation', 'table1']
+        >>> [job.name for job in jobs_of(Path("runs"), "turning", smoke=False) if not job.small]
+        ['turns', 'prior', 'reliability', 'frontend']
     """
     tail = "-smoke" if smoke else ""
     where = ("--regime", regime)
     tables = root / f"tables-{regime}{tail}"
     jobs = [Job(f"table{n}", f"eval.table{n}", tables, where) for n in (2, 3, 4, 5)]
     jobs.append(Job("figures", "eval.figures", root / f"figures-{regime}{tail}", (*where, "--tables", str(tables))))
+    jobs.append(Job("ablation", "eval.ablation", root / f"ablation{tail}"))
+    jobs.append(Job("turns", "eval.turns", root / "turns", small=False, takes=("seed", "fresh")))
+    jobs.append(Job("prior", "eval.prior", root / "prior-eval", small=False))
+    # The whole grid of the reliability job is hours; its small one shows every part.
+    reliability = Job("reliability", "eval.reliability", root / "reliability", ("--smoke",), small=False, takes=())
+    frontend = Job("frontend", "eval.frontend", root / "frontend", ("--synthetic",), small=False, takes=("seed",))
+    jobs += [replace(reliability, kept=True), replace(frontend, kept=True, prints=True)]
     jobs.append(Job("table1", "eval.table1", root / f"table1-{regime}{tail}", where))
-    return jobs
+    return [job for job in jobs if job.small or not smoke]
 
 
 def run_job(job: Job, arguments: argparse.Namespace) -> str | None:
     """Run one job in a process of its own; its last sentence where it fails."""
-    command = [sys.executable, "-m", job.module, "-o", str(job.out), *job.arguments, "--seed", str(arguments.seed)]
-    command += ["--smoke"] * arguments.smoke + ["--fresh"] * arguments.fresh
+    command = [sys.executable, "-m", job.module, "-o", str(job.out), *job.arguments]
+    command += ["--seed", str(arguments.seed)] * ("seed" in job.takes)
+    command += [f"--{name}" for name in ("smoke", "fresh") if name in job.takes and getattr(arguments, name)]
+    code = {"code": source_digest("torchrecon", "eval"), "command": command[2:]}
+    stamp = job.out / "code.json"
+    if job.kept and _there(job) and stamp.is_file() and read_json(stamp) == code:
+        print(f"== {job.name}: kept, the result of this code is there", flush=True)
+        return None
     print(f"== {job.name}: python -m {' '.join(command[2:])}", flush=True)
-    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode == 0:
+        if job.prints:
+            write_text(job.out / f"{job.name}.txt", done.stdout)
+        if job.kept:
+            write_json(stamp, code)
         return None
     said = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
     return f"{job.name} ended with exit code {done.returncode}: {said[-1]}"
@@ -114,7 +146,7 @@ def main(argv: list[str] | None = None) -> int:
     """Command line of the job; exit code 2 where a job failed (the page says which, and shows the others)."""
     parser = argparse.ArgumentParser(prog="python -m eval.all", description=__doc__.split("\n")[0])
     parser.add_argument("--regime", choices=("turning", "depth"), default="turning")
-    parser.add_argument("--only", nargs="+", metavar="JOB", help="table1 ... table5, figures; default: all")
+    parser.add_argument("--only", nargs="+", metavar="JOB", help="table1 ... table5, figures, ablation ...")
     parser.add_argument("--page", action="store_true", help="run nothing, show what is there")
     parser.add_argument("--smoke", action="store_true", help="the small version of every job")
     parser.add_argument("--fresh", action="store_true", help="throw away caches of another configuration")

@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from eval.ablation.bases import NEAR
 from eval.tables import NAMES, NOTHING, PAPER, VIEWS
 
 __all__ = ["CLAIMS", "Claim", "Verdict", "judge"]
 
 Results = Mapping[str, Any]
-"""What the jobs wrote, by name: ``table1`` to ``table5`` and ``figures``; a job that has not run is absent."""
+"""What the jobs wrote, by name: ``table1`` to ``table5``, ``figures``, ``ablation``; one that has not run is absent."""
 
 
 @dataclass(frozen=True)
@@ -227,6 +228,54 @@ def _filter_cleans(figures: Any) -> Verdict:
     )
 
 
+def _wrong_number_of_bases(ablation: Any) -> Verdict:
+    """Is the error of every solver that takes a K least near the true K?"""
+    rows = ablation.get("bases", {}).get("rows", [])
+    if not rows or any(row["minimum"] is None for row in rows):
+        return Verdict(None, "the part 'bases' of the ablation has not been computed, or lacks an answer")
+    texts, near = [], []
+    for row in rows:
+        errors = row["error3d_camera"]
+        near.append(NEAR[0] <= row["minimum"] <= NEAR[1])
+        worst = max(range(len(errors)), key=lambda i: errors[i])
+        texts.append(
+            f"{row['solver']} least at {row['minimum']:g} x the true K, {errors[worst] / min(errors):.1f} times that "
+            f"at {row['assumed'][worst] / ablation['bases']['true']:g} x"
+        )
+    return Verdict(all(near), "; ".join(texts))
+
+
+def _bases_by_count(ablation: Any) -> Verdict:
+    found = ablation.get("bases")
+    if found is None:
+        return Verdict(None, "the part 'bases' of the ablation has not been computed")
+    exact = {rule: sum(k == found["true"] for k in values) for rule, values in found["estimates"].items()}
+    count = len(found["estimates"]["paper"])
+    off = sum(found["estimates"]["paper"]) / count - found["true"]
+    return Verdict(
+        exact["paper"] == count,
+        f"the true K in {exact['paper']} of {count} films, {off:+.1f} in the mean; our rule in {exact['auto']}",
+    )
+
+
+def _stage(key: str, what: str) -> Callable[[Any], Verdict]:
+    """Is the whole road better than the variant ``key``, for every solver that was asked?"""
+
+    def test(ablation: Any) -> Verdict:
+        rows = {row["key"]: row["error3d_camera"] for row in ablation.get("stages", {}).get("variants", [])}
+        if not rows:
+            return Verdict(None, "the part 'stages' of the ablation has not been computed")
+        pairs = {name: (error, rows[key][name]) for name, error in rows["whole"].items()}
+        pairs = {name: pair for name, pair in pairs.items() if None not in pair}
+        if not pairs:
+            return Verdict(None, "no solver has both answers")
+        texts = (f"{name} {off:.3f} {what}, {on:.3f} otherwise" for name, (on, off) in pairs.items())
+        better = [off > on if key == "no-covariance" else off < on for on, off in pairs.values()]
+        return Verdict(all(better), "error3d_camera: " + "; ".join(texts))
+
+    return test
+
+
 CLAIMS = (
     Claim("III-A", "Its recognition error is the lowest in all four actions.", "table1", _lowest_recognition_error),
     Claim("Table 1", "Its recognition error is 21.22, 20.51, 20.97 and 21.08 %.", "table1", _printed_recognition_error),
@@ -241,6 +290,10 @@ CLAIMS = (
     Claim("IV (3)", "Its MSE fluctuates least.", "table5", _smaller_fluctuation(5)),
     Claim("Tables 3, 5", "PSNR and MSE as printed describe the same pictures.", "table3", _both_tables_one_picture),
     Claim("IV (1)", "Bilateral filtering removes noise and keeps the shape.", "figures", _filter_cleans),
+    Claim("abstract", "A wrongly estimated number of shape bases makes it fail.", "ablation", _wrong_number_of_bases),
+    Claim("II-C", "Eigenvalues above one, counted and divided by 6, are K.", "ablation", _bases_by_count),
+    Claim("II-C", "The covariance of the tracks helps.", "ablation", _stage("no-covariance", "without it")),
+    Claim("II-D", "Filling gaps by prediction helps.", "ablation", _stage("fill-abg", "with filled gaps")),
     Claim("III-F", "Reconstructed scattering points lie very close to the real ones.", "figures", _scatter_is_near),
     Claim("III-F", "Pro-D falls as the number of frames F grows.", "figures", _falls("frames", "snr")),
     Claim("III-F", "Pro-D falls as the SNR grows.", "figures", _falls("snr", "frames")),

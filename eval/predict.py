@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from eval.job import Cache, Profile, read_arrays, read_json, run_parallel, source_digest, write_arrays, write_json
-from eval.rows import Context, Row, RowOutput, rows_of
+from eval.rows import Context, Row, RowOutput, all_rows
 from eval.rows.base import shared_rigid, without_depth
 from eval.rows.template import load_prior
 from eval.sequences import Filmed, Filming, Sequence, film
@@ -86,7 +86,7 @@ def predict_one(work: Work) -> None:
         film(work.sequence, work.filming, filming).save(place)
         write_json(_times(work.films, work.sequence.name), filming.stages)
     profile = Profile()
-    rows = [row for row in rows_of(work.filming.regime) if row.key in work.keys and row.solve is not None]
+    rows = [row for row in all_rows(work.filming.regime) if row.key in work.keys and row.solve is not None]
     rows = [row for row in rows if not row_path(work.folder, row.key, work.sequence.name).is_file()]
     if rows:
         _solve_rows(work, Filmed.load(place), rows, profile)
@@ -117,7 +117,8 @@ def _solve_rows(work: Work, filmed: Filmed, rows: List[Row], profile: Profile) -
     context = Context(rigid, filled, prior, work.seed)
     for row in rows:
         with profile(f"row {row.key}"):
-            answer = _attempt(row, tracks, context)
+            told = replace(context, rotations=filmed.rotations) if row.oracle else context
+            answer = _attempt(row, tracks, told)
         _save_row(row_path(work.folder, row.key, work.sequence.name), answer)
 
 

@@ -20,7 +20,7 @@ import torch
 from eval.job import Profile, provenance, write_json, write_text
 from eval.predict import load_row, open_caches, predict, tracks_path
 from eval.recognisers import Reader, readers_of
-from eval.rows import FLAT, TRUE_3D, VIEWS_2D, Row, RowOutput, rows_of
+from eval.rows import FLAT, SIBLINGS, TRUE_3D, VIEWS_2D, Row, RowOutput, all_rows
 from eval.rows.template import save_prior, train_prior
 from eval.scoring import PAPER, bootstrap_cells, draw, error_by_action, table_text
 from eval.sequences import ACTIONS, Filmed, Filming, Sequence, mocap_sequences, synthetic_sequences
@@ -31,6 +31,7 @@ from torchrecon.models.recogniser import Recogniser, classify_windows, load_reco
 __all__ = ["main", "run", "score"]
 
 SMOKE_FRAMES, FRAMES = 36, 60
+SLOW = SIBLINGS  # more than 3 s of processor time a film
 
 
 def resolved(arguments: argparse.Namespace) -> tuple[list[Sequence], Filming, dict[str, Any]]:
@@ -47,6 +48,27 @@ def resolved(arguments: argparse.Namespace) -> tuple[list[Sequence], Filming, di
         per_action, frames = (1, SMOKE_FRAMES) if arguments.smoke else (arguments.per_action, FRAMES)
         sequences = synthetic_sequences(per_action, frames, arguments.seed)
     return sequences, filming, {"prior_bodies": _prior_bodies(arguments.smoke), "seed": arguments.seed}
+
+
+def chosen_rows(regime: str, names: list[str] | None) -> tuple[Row, ...]:
+    """The rows of the table: all but the slow ones, or those named and what they are held against.
+
+    Raises:
+        ReconError: no row of this regime has that name.
+
+    Example:
+        >>> [row.key for row in chosen_rows("turning", ["pnd2", "rigid"])]
+        ['rigid', 'pnd2', 'default', 'flat', 'views2d', 'true3d']
+    """
+    rows = all_rows(regime)
+    if names is None:
+        return tuple(row for row in rows if row not in SLOW)
+    known = [row.key for row in rows]
+    for name in names:
+        if name not in known:
+            raise ReconError(f"--rows {name}: is not one of {', '.join(known)}")
+    always = {"default", FLAT.key, VIEWS_2D.key, TRUE_3D.key}
+    return tuple(row for row in rows if row.key in {*names, *always})
 
 
 def _prior_bodies(smoke: bool) -> int:
@@ -133,6 +155,7 @@ def _row_result(row: Row, counts: Any, by_source: Any, errors: Any, notes: Any, 
         "supervised": row.supervised,
         "filled": row.filled,
         "uses_depth": row.uses_depth,
+        "oracle": row.oracle,
         "paper": paper,
         "cells": {
             name: asdict(cell)
@@ -173,7 +196,7 @@ def _remarks(rows: tuple[Row, ...], table: list[dict[str, Any]], notes: dict[str
             first = notes[row.key][refused[0]]
             remarks.append(f"{row.label}: {len(refused)} sequences count as wrong ({refused[0]}: {first})")
     styles = [key for key in ("ref5", "ref6", "ref7", "ref8") if key in cells]
-    for name in cells["default"]:
+    for name in cells["default"] if styles else ():
         default = cells["default"][name]["error"]
         best = min(styles, key=lambda key: cells[key][name]["error"])
         ahead = cells[best][name]["error"] - default
@@ -208,7 +231,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
     if not prior.is_file():
         with profile("shape prior (Ref. 4)"):
             save_prior(prior, train_prior(ACTIONS, _prior_bodies(arguments.smoke), seed=arguments.seed))
-    rows = rows_of(filming.regime)
+    rows = chosen_rows(filming.regime, arguments.rows)
     keys = tuple(row.key for row in rows)
     profile.merge(predict(films, cache, sequences, filming, prior, keys, arguments.seed, arguments.workers))
     with profile("recogniser (reading)"):
@@ -295,6 +318,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--per-action", type=int, default=10, help="test sequences of each action")
     parser.add_argument(
         "--recogniser-seeds", type=int, default=1, metavar="N", help="read with N recognisers, report their mean"
+    )
+    parser.add_argument(
+        "--rows", nargs="+", metavar="NAME", help="these rows by their keys, with default, flat, 2D and true 3D"
     )
     parser.add_argument("--smoke", action="store_true", help="small: ends in 90 s")
     parser.add_argument("--only-films", action="store_true", help="film and track, then stop; the rows come later")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -109,3 +111,51 @@ def test_a_job_that_fails_is_named_and_the_page_is_written(tmp_path, monkeypatch
     assert "table9 ended with exit code 1" in (tmp_path / "all-turning.html").read_text()
     assert everything.main(["--only", "table1", "-o", str(tmp_path)]) == 2
     assert "--only table1: is not one of table9" in capsys.readouterr().err
+
+
+def test_claims_about_bases_and_stages_are_read_from_the_ablation():
+    def row(solver: str, errors: list[float], minimum: float) -> dict:
+        return {"solver": solver, "assumed": [2, 4, 8], "error3d_camera": errors, "minimum": minimum}
+
+    near, far = row("em_ppca", [0.3, 0.1, 0.2], 1.0), row("csf", [0.1, 0.4, 0.5], 0.5)
+    bases = {"true": 4, "rows": [near], "estimates": {"paper": [7, 6], "auto": [4, 3]}}
+    text = "A wrongly estimated number of shape bases makes it fail."
+    assert verdict(text, {"ablation": {"bases": bases}}).holds
+    lost = verdict(text, {"ablation": {"bases": {**bases, "rows": [near, far]}}})
+    assert lost.holds is False
+    assert "csf least at 0.5 x the true K, 5.0 times that at 2 x" in lost.why
+    counted = verdict("Eigenvalues above one, counted and divided by 6, are K.", {"ablation": {"bases": bases}})
+    assert counted.holds is False
+    assert counted.why == "the true K in 0 of 2 films, +2.5 in the mean; our rule in 1"
+
+    def variant(key: str, default: float, other: float | None) -> dict:
+        return {"key": key, "error3d_camera": {"auto": default, "em_ppca": other}}
+
+    stages = [variant("whole", 0.1, 0.2), variant("no-covariance", 0.15, None), variant("fill-abg", 0.05, 0.3)]
+    results = {"ablation": {"stages": {"variants": stages}}}
+    assert verdict("The covariance of the tracks helps.", results).holds
+    assert verdict("Filling gaps by prediction helps.", results).holds is False
+    for claim in CLAIMS:
+        if claim.needs == "ablation":
+            assert judge(claim, {"ablation": {}}).holds is None
+
+
+def test_a_job_without_a_cache_is_kept_while_the_code_is_the_same(tmp_path, monkeypatch):
+    job = everything.Job("said", "eval.said", tmp_path / "said", ("word",), kept=True, prints=True, takes=("seed",))
+    commands = []
+
+    def run(command, **_):
+        commands.append(command[3:])
+        write_json(job.out / "said.json", {})
+        return subprocess.CompletedProcess(command, 0, stdout="a word\n", stderr="")
+
+    monkeypatch.setattr(everything.subprocess, "run", run)
+    arguments = argparse.Namespace(seed=3, smoke=True, fresh=True)
+    assert everything.run_job(job, arguments) is None
+    assert commands == [["-o", str(job.out), "word", "--seed", "3"]]
+    assert (job.out / "said.txt").read_text() == "a word\n"
+    assert everything.run_job(job, arguments) is None
+    assert len(commands) == 1
+    monkeypatch.setattr(everything, "source_digest", lambda *_: "changed")
+    assert everything.run_job(job, arguments) is None
+    assert len(commands) == 2

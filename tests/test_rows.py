@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from eval.rows import SIBLINGS, all_rows, rows_of
 from eval.rows.base import Context, Views, in_camera, registered_views, with_perspective
+from eval.rows.oracle import solve_true_rotations
 from eval.rows.ref4_style import TemplateParams, _solve_chain, fit_prior, fit_template
 from eval.rows.ref4_style import solve as solve_ref4
 from eval.rows.ref5_style import piecewise_rigid
@@ -20,8 +23,9 @@ from eval.rows.ref8_style import SeriesParams, cosines, series_solve
 from eval.rows.ref8_style import solve as solve_ref8
 from torchrecon.errors import ReconError
 from torchrecon.linalg import rotation_from_vector
-from torchrecon.measurement import Reconstruction, Status, Tracks
+from torchrecon.measurement import FilledTracks, Reconstruction, Status, Tracks
 from torchrecon.measurement.camera import project_points
+from torchrecon.metrics import error3d_camera
 
 FRAMES, POINTS = 60, 300
 
@@ -272,3 +276,43 @@ def test_ref4_without_a_prior_is_refused(rigid_world):
     tracks, rigid, _ = pinhole_world(rigid_world)
     with pytest.raises(ReconError, match="shape prior"):
         solve_ref4(tracks, Context(rigid))
+
+
+def test_the_oracle_needs_the_rotations_and_no_world_axes(rigid_world):
+    tracks, rigid, truth = pinhole_world(rigid_world)
+    seen = tracks.visible
+    with pytest.raises(ReconError, match="true rotations"):
+        solve_true_rotations(tracks, Context(rigid))
+    answer = solve_true_rotations(tracks, Context(rigid, rotations=rigid.rotations)).points3d
+    assert float(error3d_camera(answer, truth, seen, align_scale="sequence")) < 0.02
+    # Another upright world, or one that lies on its side, is the same camera path.
+    other = rotation_from_vector(torch.tensor([0.3, -1.0, 2.0]))
+    again = solve_true_rotations(tracks, Context(rigid, rotations=rigid.rotations @ other)).points3d
+    torch.testing.assert_close(again, answer, atol=1e-6, rtol=0)
+    # It believes what it is told: half the turn gives a deeper body.
+    half = solve_true_rotations(tracks, Context(rigid, rotations=turns(2.6))).points3d
+    assert float(error3d_camera(half, truth, seen, align_scale="sequence")) > 0.1
+
+
+def test_siblings_are_marked_and_work_on_the_filled_matrix(rigid_world):
+    rotations, _, visible, truth = rigid_world
+    whole = Tracks(100 * truth[..., :2] + 300)
+    tracks = replace(whole, visible=visible)
+    eye = torch.eye(2).expand(*visible.shape, 2, 2)
+    filled = FilledTracks(whole.xy, eye, ~visible, torch.zeros_like(visible))
+    still = Reconstruction.from_points(truth, rotations, rank=1, status=Status("ok", "by hand"))
+    for row in SIBLINGS[:2]:
+        assert row.filled
+        answer = row.solve(tracks, Context(still, filled))
+        # The gaps are filled with the truth here, so nothing is lost.
+        assert float(error3d_camera(answer.points3d, truth, visible, align_scale="sequence")) < 0.02
+        assert answer.note.startswith("K = ")
+
+
+def test_extra_rows_stand_beside_the_default_and_only_the_oracle_is_told():
+    for regime in ("turning", "depth"):
+        keys = [row.key for row in all_rows(regime)]
+        assert set(keys) >= {row.key for row in rows_of(regime)}
+        assert len(keys) == len(set(keys))
+        assert ("true-rotations" in keys) == (regime == "turning")
+        assert [row.key for row in all_rows(regime) if row.oracle] == ["true-rotations"] * (regime == "turning")

@@ -292,3 +292,15 @@ def test_recognisers_of_all_folds_and_seeds_are_asked_for(tmp_path, monkeypatch)
         fold = 1 if "fold1" in arguments[arguments.index("--out") + 1] else 0
         assert arguments[arguments.index("--exclude") + 1] == "ab"[fold]
         assert ("--seed" in arguments) == ("seed1" in arguments[arguments.index("--out") + 1])
+
+
+def test_named_rows_come_with_what_they_are_held_against():
+    keys = [row.key for row in table1.chosen_rows("turning", ["pnd2"])]
+    assert keys == ["pnd2", "default", "flat", "views2d", "true3d"]
+    everything = {row.key for row in table1.chosen_rows("turning", None)}
+    assert everything >= {row.key for row in ROWS} | {"true-rotations"}
+    assert "pnd2" not in everything
+    with pytest.raises(ReconError, match="--rows true-rotations: is not one of"):
+        table1.chosen_rows("depth", ["true-rotations"])
+    with pytest.raises(ReconError, match="--rows nobody"):
+        table1.chosen_rows("turning", ["nobody"])

@@ -2,19 +2,39 @@
 
 from eval.rows import reference
 from eval.rows.base import Context, Row, RowOutput
+from eval.rows.oracle import solve_true_rotations
 from eval.rows.papers_rules import solve as solve_papers_rules
 from eval.rows.ref4_style import solve as solve_ref4
 from eval.rows.ref5_style import solve as solve_ref5
 from eval.rows.ref6_style import solve as solve_ref6
 from eval.rows.ref7_style import solve as solve_ref7
 from eval.rows.ref8_style import solve as solve_ref8
+from eval.rows.siblings import solve_with
 
-__all__ = ["FLAT", "ROWS", "SENSOR", "TRUE_3D", "VIEWS_2D", "Context", "Row", "RowOutput", "rows_of"]
+__all__ = [
+    "FLAT",
+    "ORACLE",
+    "ROWS",
+    "SENSOR",
+    "SIBLINGS",
+    "TRUE_3D",
+    "VIEWS_2D",
+    "Context",
+    "Row",
+    "RowOutput",
+    "all_rows",
+    "rows_of",
+]
 
 FLAT = Row("flat", "flat (zero depth)", reference.solve_flat)
 SENSOR = Row("sensor", "sensor depth, no method", reference.solve_sensor, uses_depth=True)
 VIEWS_2D = Row("views2d", "2D-trained recogniser")  # reads the predictions of FLAT
 TRUE_3D = Row("true3d", "true 3D")
+ORACLE = Row("true-rotations", "true rotations (oracle)", solve_true_rotations, oracle=True)
+SIBLINGS = tuple(
+    Row(name, f"{label} (filled)", solve_with(name), filled=True)
+    for name, label in (("pta", "PTA"), ("bmm", "BMM"), ("pnd2", "PND2"))
+)
 
 ROWS = (
     Row("ref4", "Ref. 4-style (supervised)", solve_ref4, supervised=True),
@@ -37,3 +57,17 @@ def rows_of(regime: str) -> tuple[Row, ...]:
         return ROWS
     place = ROWS.index(FLAT)
     return (*ROWS[:place], SENSOR, *ROWS[place:])
+
+
+def all_rows(regime: str) -> tuple[Row, ...]:
+    """What Table 1 can show: besides :func:`rows_of` the library's other solvers, and before a turning camera, whose
+    path has to be found, the oracle that is told the rotations.
+
+    Example:
+        >>> [row.key for row in all_rows("turning") if row not in rows_of("turning")]
+        ['pta', 'bmm', 'pnd2', 'true-rotations']
+    """
+    rows = rows_of(regime)
+    place = rows.index(next(row for row in rows if row.key == "default"))
+    oracle = (ORACLE,) if regime == "turning" else ()
+    return (*rows[:place], *SIBLINGS, rows[place], *oracle, *rows[place + 1 :])

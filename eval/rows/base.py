@@ -58,12 +58,14 @@ class Context:
         filled: gap-free tracks for the rows that need complete matrices.
         prior: trained shape prior for the supervised row, else None.
         seed: of every random choice in a row.
+        rotations: (frames, 3, 3) world -> camera, of the film: for oracle rows alone, else None.
     """
 
     rigid: Reconstruction
     filled: FilledTracks | None = None
     prior: Any = None
     seed: int = 0
+    rotations: Float[Tensor, "frames 3 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Row:
         supervised: trained on 3D that other rows do not get.
         filled: works on the filled tracks because it needs complete matrices.
         uses_depth: reads measured depth where the tracks have it.
+        oracle: is told something of the truth: a bound for what others could reach, not a method.
     """
 
     key: str
@@ -85,6 +88,7 @@ class Row:
     supervised: bool = False
     filled: bool = False
     uses_depth: bool = False
+    oracle: bool = False
 
 
 @dataclass(frozen=True)
