@@ -79,7 +79,7 @@ class Row:
         supervised: trained on 3D that other rows do not get.
         filled: works on the filled tracks because it needs complete matrices.
         uses_depth: reads measured depth where the tracks have it.
-        oracle: is told something of the truth: a bound for what others could reach, not a method.
+        oracle: is told something of the truth, so it is no method.
     """
 
     key: str

@@ -1,8 +1,9 @@
-"""True rotations: what is left to gain from a better camera path.
+"""True rotations: what is left to gain from better rotations of the camera.
 
 The rotations are those of the film; the translation is that of the rigid body which fits the tracks best under them,
 and the points are the posterior mean of the default's Gaussian-process trajectories, kernels learned as there.
 Rest positions are spread alike in all directions: the turn is known, so no candidate has to be charged for it.
+Not a bound: the translation is not refined, and a body that turns by itself may be described better by another path.
 """
 
 from __future__ import annotations
