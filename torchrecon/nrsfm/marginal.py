@@ -131,11 +131,13 @@ def solve_marginal(
         if small is not None:
             return _flat(data, rank, small).to(dtype=dtype)
     complete, centre = filled(data, params.fill_rank)
-    views = smoothed(_views(data, complete, params), complete, params.smoothing)
+    raw = _views(data, complete, params)
+    views = smoothed(raw, complete, params.smoothing)
     asked = torch.is_grad_enabled() and (views.xy.requires_grad or views.noise.requires_grad)
     with torch.no_grad():
         fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
-        model, eps, starts, converged = _search(fixed, (complete - centre[:, None]).detach(), generator, params)
+        draws = 1.0 if views is raw else float(fixed.noise.mean() / raw.noise.mean())
+        model, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
         if asked:
             model = settled(fixed, model, eps)
     if asked:
@@ -160,11 +162,12 @@ def solve_marginal(
 
 
 def _search(
-    views: Views, complete: Tensor, generator: torch.Generator, params: MarginalParams
+    views: Views, draws: float, complete: Tensor, generator: torch.Generator, params: MarginalParams
 ) -> tuple[ShapeModel, float, int, bool]:
     """The likeliest model: from the coarse residual to the fine one, from several starts until one is the likeliest.
 
     Args:
+        draws: share of the observations that are independent of one another.
         complete: (frames, points, 2) centred tracks without gaps, for the starts.
 
     Returns:
@@ -185,7 +188,7 @@ def _search(
         # What the loadings avoid follows the mean shape only in a growth, so the last level grows again and again.
         for turn in range(params.last_rounds if level == params.levels - 1 else 1):
             for _ in range(params.growths):
-                model = grow_loadings(views, model, eps, params.modes, noise)
+                model = grow_loadings(views, model, eps, params.modes, noise, draws)
             last = value
             model, value, converged = descend(views, model, eps, params.steps, params.descent)
             if turn and float((last - value).amax()) < params.settled * len(complete):

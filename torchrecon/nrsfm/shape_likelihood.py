@@ -193,12 +193,17 @@ def evaluate(views: Views, model: ShapeModel, eps: float, *, with_spread: bool =
     return Evaluation(value, pose, mean - mean.mean(-2, keepdim=True), loadings, fisher, points, spread, translation)
 
 
-def grow_loadings(views: Views, model: ShapeModel, eps: float, most: int, noise: float = 0.0) -> ShapeModel:
+def grow_loadings(
+    views: Views, model: ShapeModel, eps: float, most: int, noise: float = 0.0, draws: float = 1.0
+) -> ShapeModel:
     """One step of expectation-maximisation for mean and loadings: principal directions of the expected covariance.
 
     Directions whose variance exceeds that of the residual become modes, at most ``most``: the number of modes finds
-    itself. ``noise`` is the variance of the observations that a mode has to be told from, zero for exact ones. Loadings
-    of fewer modes are padded with zeros to the largest of the batch.
+    itself. Loadings of fewer modes are padded with zeros to the largest of the batch.
+
+    Args:
+        noise: variance of the observations that a mode has to be told from, zero for exact ones.
+        draws: independent observations among as many: what smoothing over time has left.
     """
     now = evaluate(views, model, eps, with_spread=True)
     assert now.spread is not None
@@ -227,8 +232,13 @@ def grow_loadings(views: Views, model: ShapeModel, eps: float, most: int, noise:
     strength = (values + residual[..., None] - eps**2).clamp_min(0)
     # What noise does in so few frames (Baik, Ben Arous and Peche 2005): signal over noise must exceed the root of
     # dimensions over samples, and a frame measures two of three coordinates.
-    least = noise * (1.5 * mean.shape[-2] * 3 / frames) ** 0.5
-    strength = torch.where(strength > least, strength, torch.zeros_like(strength))
+    ratio = 1.5 * mean.shape[-2] * 3 / frames
+    strength = torch.where(strength > noise * ratio**0.5, strength, torch.zeros_like(strength))
+    # A body bends at all only if its strongest mode stands above all that correlated noise does to a rigid one
+    # (edge of Marchenko and Pastur).
+    ratio /= draws
+    bends = strength[..., :1] > noise * (ratio + 2 * ratio**0.5) if draws < 1 else strength[..., :1] > 0
+    strength = torch.where(bends, strength, torch.zeros_like(strength))
     modes = int((strength > 0).sum(-1).max())
     loadings = vectors[..., :modes] * strength[..., None, :modes].sqrt()
     return ShapeModel(model.rotations, model.scale, mean, loadings.unflatten(-2, (mean.shape[-2], 3)), avoided)
