@@ -59,3 +59,9 @@ def test_every_example_says_what_it_shows_and_is_run_by_a_test(path):
     assert load(path.stem).__doc__
     tests = "".join(file.read_text() for file in Path(__file__).parent.glob("test_*.py"))
     assert f'"{path.stem}"' in tests
+
+
+def test_keypoint_refiner_learns_through_the_reconstruction(capsys):
+    errors = load("keypoint_refiner").main(films=1, rounds=4)
+    assert errors[-1] < 0.7 * errors[0]
+    assert "before" in capsys.readouterr().out

@@ -19,9 +19,7 @@ import hashlib
 import json
 import logging
 import math
-import platform
 import shutil
-import subprocess
 import sys
 import time
 import warnings
@@ -40,7 +38,6 @@ from torch.nn import functional as F
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-import torchrecon
 from torchrecon.data.mocap import MocapClip, load_mocap
 from torchrecon.data.synthetic import ACTIONS
 from torchrecon.errors import ReconError
@@ -58,6 +55,7 @@ from train.films import (
     mocap_film,
     synthetic_film,
 )
+from train.runs import made_by, origin
 from train.validity import ASKED, FLAT_AT_LEAST, TRUE_AT_MOST, report_text, validity
 
 CONFIG = Path(__file__).parents[1] / "configs" / "recogniser.yaml"
@@ -267,7 +265,7 @@ def main(arguments: list[str] | None = None) -> int:
     half_way = out.with_suffix(f".{digest[:12]}")
     for leftover in out.parent.glob(f".{out.name}.*"):  # of a run that was killed as it wrote
         shutil.rmtree(leftover)
-    if not command.config.force and _made_by(out) == digest:
+    if not command.config.force and made_by(out) == digest:
         shutil.rmtree(half_way, ignore_errors=True)
         print(f"{out} is already there, made with these settings (--force makes it again)")
         return 0
@@ -279,7 +277,7 @@ def main(arguments: list[str] | None = None) -> int:
     command.trainer.fit(command.model, command.datamodule, ckpt_path=resume, weights_only=True)
     recogniser = command.model.trained()
 
-    report: dict[str, Any] = {"settings": settings, "settings_hash": digest, **_origin()}
+    report: dict[str, Any] = {"settings": settings, "settings_hash": digest, **origin()}
     data = command.datamodule
     if data.validation_films and (data.file is None or data.exclude):
         who = "bodies that were" if data.file is None else "people who were"
@@ -338,27 +336,6 @@ def _settings(command: Command) -> dict[str, Any]:
         data["file"] = hashlib.sha256(Path(data["file"]).read_bytes()).hexdigest()
     epochs = config["trainer"]["max_epochs"]
     return {"model": config["model"], "data": data, "epochs": epochs, "seed": config["seed_everything"]}
-
-
-def _origin() -> dict[str, str]:
-    """Which code on which machine."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=CONFIG.parent, capture_output=True, text=True, check=False
-    )
-    return {
-        "commit": commit.stdout.strip() or "unknown",
-        "torchrecon": torchrecon.__version__,
-        "torch": torch.__version__,
-        "lightning": L.__version__,
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-    }
-
-
-def _made_by(out: Path) -> str | None:
-    """The settings of the weights that are already there."""
-    report = out.with_suffix(".json")
-    return json.loads(report.read_text()).get("settings_hash") if out.is_file() and report.is_file() else None
 
 
 if __name__ == "__main__":

@@ -38,7 +38,8 @@ def solve(options: argparse.Namespace) -> None:
     tracks = _load(options)
     if options.camera is not None:
         tracks = _with_camera(tracks, options.camera)
-    answer = reconstruct_tracks(tracks, _rank(options.rank), options.solver, generator=_generator(options))
+    prior = _prior(options)
+    answer = reconstruct_tracks(tracks, _rank(options.rank), options.solver, prior, _generator(options))
     path = answer.save(options.out)
     _say(options, _summary(answer) | {"out": str(path)})
 
@@ -214,6 +215,12 @@ def _with_camera(tracks: Tracks, path: str) -> Tracks:
     from torchrecon.io.frames import load_camera
 
     return replace(tracks, intrinsics=load_camera(path).intrinsics)
+
+
+def _prior(options: argparse.Namespace) -> Any:
+    from torchrecon.models.prior import load_prior
+
+    return None if options.prior is None else load_prior(options.prior).to(options.device)
 
 
 def _rank(text: str) -> Any:

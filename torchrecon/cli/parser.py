@@ -27,6 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--rank", default="auto", metavar="auto|INT", help="number of shape bases (default: auto)")
     solve.add_argument("--solver", default="auto", metavar="NAME", help="solver (default: auto)")
     solve.add_argument("--camera", metavar="FILE", help="camera JSON with the 3x3 intrinsics")
+    solve.add_argument("--prior", metavar="FILE", help="learned prior of human shape, for tracks of named joints")
 
     rank = _command(commands, "rank", "number of shape bases of a tracks file")
     _tracks(rank)

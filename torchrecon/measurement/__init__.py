@@ -1,8 +1,9 @@
 """What is measured and what comes out: tracks, reconstructions, rank estimates, cameras and matrix views."""
 
+from torchrecon.measurement.belief import ShapeBelief
 from torchrecon.measurement.camera import backproject_points, normalised_coordinates, project_points
 from torchrecon.measurement.filled import FilledTracks
-from torchrecon.measurement.protocols import GapFiller, RankRule, Solver
+from torchrecon.measurement.protocols import GapFiller, RankRule, ShapePrior, Solver
 from torchrecon.measurement.rank_estimate import RankEstimate
 from torchrecon.measurement.reconstruction import Reconstruction, Status
 from torchrecon.measurement.tracks import Tracks
@@ -14,6 +15,8 @@ __all__ = [
     "RankEstimate",
     "RankRule",
     "Reconstruction",
+    "ShapeBelief",
+    "ShapePrior",
     "Solver",
     "Status",
     "Tracks",

@@ -7,8 +7,10 @@ import torch
 from torchrecon._typing import Bool, Int, Tensor
 from torchrecon.measurement import Reconstruction, Tracks
 from torchrecon.nrsfm.base import solve_items
+from torchrecon.nrsfm.dense import DenseParams, solve_dense
 from torchrecon.nrsfm.marginal import solve_marginal
 from torchrecon.nrsfm.trajectory import solve_trajectories
+from torchrecon.nrsfm.windows import WindowParams, solve_windows
 
 __all__ = ["auto", "meet"]
 
@@ -37,12 +39,21 @@ def meet(visible: Bool[Tensor, "frames points"]) -> bool:
 def auto(
     tracks: Tracks, rank: int | Int[Tensor, "*batch"], *, generator: torch.Generator | None = None
 ) -> Reconstruction:
-    """Orthographic tracks of points that are mostly seen together: marginal likelihood of low-rank shapes; anything
-    else, bands of short tracks, pinholes and measured depth: Gaussian-process trajectories."""
+    """Orthographic tracks of points that are mostly seen together: marginal likelihood of low-rank shapes, in windows
+    where they are long and through a sample of the points where those are many; anything else, bands of short tracks,
+    pinholes and measured depth: Gaussian-process trajectories."""
+    return solve_items(tracks, rank, _solve_one, generator)
 
-    def solve_one(item: Tracks, k: int, source: torch.Generator) -> Reconstruction:
-        if item.intrinsics is None and meet(item.visible):
-            return solve_marginal(item, k, source)
-        return solve_trajectories(item, k, source)
 
-    return solve_items(tracks, rank, solve_one, generator)
+def _solve_one(item: Tracks, rank: int, generator: torch.Generator) -> Reconstruction:
+    if item.intrinsics is not None or not meet(item.visible):
+        return solve_trajectories(item, rank, generator)
+    if item.frames > WindowParams().longest:
+        return solve_windows(item, rank, generator, _together)
+    return _together(item, rank, generator)
+
+
+def _together(item: Tracks, rank: int, generator: torch.Generator) -> Reconstruction:
+    if item.points > DenseParams().most:
+        return solve_dense(item, rank, generator, solve_marginal)
+    return solve_marginal(item, rank, generator)

@@ -9,8 +9,9 @@ import torch
 from torch import nn
 
 from torchrecon.errors import ReconError
-from torchrecon.measurement import Reconstruction, Solver, Tracks
+from torchrecon.measurement import Reconstruction, ShapePrior, Solver, Tracks
 from torchrecon.nrsfm import get_solver
+from torchrecon.nrsfm.with_prior import with_prior
 from torchrecon.rank import estimate_rank
 
 __all__ = ["Reconstructor", "reconstruct"]
@@ -20,7 +21,7 @@ def reconstruct(
     tracks: Tracks,
     rank: int | Literal["auto"] = "auto",
     solver: str | Solver = "auto",
-    prior: None = None,
+    prior: ShapePrior | None = None,
     generator: torch.Generator | None = None,
 ) -> Reconstruction:
     """Non-rigid structure from motion with one configuration and no K given.
@@ -30,14 +31,16 @@ def reconstruct(
         rank: number of shape bases K, the mean shape counted; ``"auto"`` takes
             :func:`torchrecon.estimate_rank`.
         solver: a name from ``torchrecon.nrsfm``, or a callable of the ``Solver`` protocol.
-        prior: a learned shape prior; none exists yet, so only None is taken.
+        prior: a learned shape prior (:func:`torchrecon.models.prior.load_prior`), for tracks with named human joints:
+            where the view does not determine the shape the depth is the prior's, elsewhere it sharpens the answer.
         generator: source of all randomness; None means a fixed seed, so the answer is always the same.
 
     Returns:
         Reconstruction: with ``status`` saying in words whether the data determine the answer.
 
     Raises:
-        ReconError: unknown solver, a rank that is no positive integer, unusable tracks.
+        ReconError: unknown solver, a rank that is no positive integer, unusable tracks, points that the prior does not
+            know.
 
     Example:
         >>> import torch
@@ -50,9 +53,13 @@ def reconstruct(
         >>> rec.points3d.shape, rec.status.code
         (torch.Size([20, 12, 3]), 'ok')
     """
-    if prior is not None:
-        raise ReconError("prior: no learned shape prior exists yet; leave prior=None")
     solve = get_solver(solver) if isinstance(solver, str) else solver
+    if prior is not None:
+        if not callable(prior):
+            raise ReconError(
+                f"prior: {type(prior).__name__} is no shape prior; torchrecon.models.prior.load_prior gives one"
+            )
+        solve = with_prior(solve, prior)
     if rank == "auto":
         estimate = estimate_rank(tracks.detach(), generator=generator)
         answer = solve(tracks, estimate.rank, generator=generator)
@@ -70,7 +77,12 @@ class Reconstructor(nn.Module):
         Reconstructor(rank=2, solver='rigid')
     """
 
-    def __init__(self, rank: int | Literal["auto"] = "auto", solver: str | Solver = "auto", prior: None = None) -> None:
+    def __init__(
+        self,
+        rank: int | Literal["auto"] = "auto",
+        solver: str | Solver = "auto",
+        prior: ShapePrior | None = None,
+    ) -> None:
         super().__init__()
         self.rank: int | Literal["auto"] = rank
         self.solver = solver
