@@ -9,9 +9,11 @@ import math
 import pytest
 import torch
 import yaml
+from scipy.stats import chi2
 
 from eval.job import ROOT
 from eval.reliability.__main__ import main, read_config
+from eval.reliability.coverage import LEVELS
 from eval.reliability.motions import humaneva_joints, synthetic_joints
 from eval.reliability.ranks import grid
 from eval.reliability.world import low_rank_tracks
@@ -68,6 +70,7 @@ def test_a_small_run_writes_what_it_prints(tmp_path, capsys):
     config["gaps"].update(shares=[0.05], trials=1)
     config["paper"].update(cells=[[300, 30, 1]], trials=1)
     config["filling"].update(films=1, lengths=[1, 5])
+    config["coverage"].update(sizes=[[40, 20, 1]], snr=[20.0], trials=1)
     small = tmp_path / "small.yaml"
     small.write_text(yaml.safe_dump(config))
     default = torch.get_default_dtype()
@@ -82,7 +85,13 @@ def test_a_small_run_writes_what_it_prints(tmp_path, capsys):
     auto = [r for r in result["rank"]["records"] if r["part"] == "grid" and r["rule"] == "auto"]
     assert [r["rank"] == r["bases"] for r in auto] == [True, True]
     assert {r["length"] for r in result["filling"]["records"]} == {1, 5}
+    assert [r["held"]["0.95"] > 0.8 for r in result["coverage"]["records"]] == [True]
+    assert "True points inside the ellipsoid" in text
     assert (tmp_path / "out" / "reliability.png").stat().st_size > 10_000
+
+
+def test_levels_of_the_ellipsoids_are_quantiles():
+    assert [chi2.ppf(level, 3) for level in LEVELS] == pytest.approx(list(LEVELS.values()), abs=1e-4)
 
 
 def test_bad_input_is_named(tmp_path, capsys):
