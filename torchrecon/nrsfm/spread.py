@@ -129,7 +129,9 @@ def widened(
         >>> round(float(wide[:20, :, 2, 2].mean())), round(float(wide[-20:, :, 2, 2].mean()))
         (5, 33)
     """
-    root = torch.linalg.cholesky(covariance.detach())
+    # Exact tracks leave nothing open in the image; the ridge keeps the root of their covariance.
+    ridge = 1e-9 * covariance.detach().diagonal(dim1=-2, dim2=-1).mean(-1) + torch.finfo(covariance.dtype).tiny ** 0.5
+    root = torch.linalg.cholesky(covariance.detach() + torch.diag_embed(ridge[..., None].expand(*ridge.shape, 3)))
     white = torch.linalg.solve_triangular(root, errors[..., None], upper=False)[..., 0]
     common = torch.einsum("dfpi,dfpj->ij", white, white) / white[..., 0].numel()
     values, vectors = torch.linalg.eigh(common)
