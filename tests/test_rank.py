@@ -13,6 +13,7 @@ from torchrecon.errors import ReconError
 from torchrecon.linalg.noise_edge import complement_basis, count_signals, spectrum, tracy_widom_edge
 from torchrecon.measurement import Tracks, stack_matrix, vector_matrix
 from torchrecon.rank import RULES, cross_validate, estimate_rank
+from torchrecon.rank.band_limited import motion_band
 
 
 def _scene(*arguments: Any, **options: Any) -> tuple[torch.Tensor, torch.Tensor, float]:
@@ -265,3 +266,27 @@ def test_unseen_entries_are_never_read_and_seeds_decide() -> None:
         results.append(cross_validate(poisoned, visible, 4, torch.Generator().manual_seed(3)).errors)
     assert results[0] == results[1] == results[2]
     assert cross_validate(xy, visible, 4, torch.Generator().manual_seed(4)).errors != results[0]
+
+
+def test_a_basis_below_the_edge_of_all_frames_stands_above_that_of_the_band_it_moves_in() -> None:
+    weak = [_scene(300, 30, 2, -5.0, seed) for seed in range(8)]
+    counts = {
+        rule: [estimate_rank(Tracks(xy), rule).rank for xy, _, _ in weak]
+        for rule in ("kritchman_nadler", "band_limited")
+    }
+    assert counts["band_limited"].count(2) > counts["kritchman_nadler"].count(2)
+    assert max(counts["band_limited"]) == 2
+    noise = torch.randn(300, 30, 2, generator=torch.Generator().manual_seed(0))
+    band = motion_band((noise - noise.mean(1, keepdim=True)).mT[..., 1:])
+    assert len(band.kept) < 60  # what does not move at all leaves nothing but noise above the band
+    assert band.noise == pytest.approx(float(noise.square().mean()), rel=0.05)
+
+
+def test_without_smoothness_the_band_is_all_frames_and_the_rule_that_of_kritchman_and_nadler() -> None:
+    g = torch.Generator().manual_seed(0)
+    a, b = torch.randn(60, 2, 6, generator=g), torch.randn(40, 6, generator=g)
+    xy = torch.einsum("fck,pk->fpc", a, b) + 0.3 * torch.randn(60, 40, 2, generator=g)
+    ours, reference = (estimate_rank(Tracks(xy), rule) for rule in ("band_limited", "kritchman_nadler"))
+    assert ours.rank == reference.rank == 2
+    torch.testing.assert_close(ours.eigenvalues, reference.eigenvalues)
+    torch.testing.assert_close(ours.threshold, reference.threshold)

@@ -9,9 +9,12 @@ import math
 import pytest
 import torch
 import yaml
+from scipy.stats import chi2
 
 from eval.job import ROOT
 from eval.reliability.__main__ import main, read_config
+from eval.reliability.coverage import LEVELS
+from eval.reliability.heldout import Clip2D, bootstrap_mean, run_clip, turned_view
 from eval.reliability.motions import humaneva_joints, synthetic_joints
 from eval.reliability.ranks import grid
 from eval.reliability.world import low_rank_tracks
@@ -68,6 +71,7 @@ def test_a_small_run_writes_what_it_prints(tmp_path, capsys):
     config["gaps"].update(shares=[0.05], trials=1)
     config["paper"].update(cells=[[300, 30, 1]], trials=1)
     config["filling"].update(films=1, lengths=[1, 5])
+    config["coverage"].update(sizes=[[30, 15, 1]], snr=[20.0], trials=1)
     small = tmp_path / "small.yaml"
     small.write_text(yaml.safe_dump(config))
     default = torch.get_default_dtype()
@@ -82,7 +86,13 @@ def test_a_small_run_writes_what_it_prints(tmp_path, capsys):
     auto = [r for r in result["rank"]["records"] if r["part"] == "grid" and r["rule"] == "auto"]
     assert [r["rank"] == r["bases"] for r in auto] == [True, True]
     assert {r["length"] for r in result["filling"]["records"]} == {1, 5}
+    assert [r["held"]["0.95"] > 0.7 for r in result["coverage"]["records"]] == [True]
+    assert "True points inside the ellipsoid" in text
     assert (tmp_path / "out" / "reliability.png").stat().st_size > 10_000
+
+
+def test_levels_of_the_ellipsoids_are_quantiles():
+    assert [chi2.ppf(level, 3) for level in LEVELS] == pytest.approx(list(LEVELS.values()), abs=1e-4)
 
 
 def test_bad_input_is_named(tmp_path, capsys):
@@ -93,5 +103,33 @@ def test_bad_input_is_named(tmp_path, capsys):
     assert "costly" in capsys.readouterr().err
     assert main(["--only", "filling", "--smoke", "--data", str(tmp_path), "-o", str(tmp_path / "o")]) == 2
     assert "dev.npz" in capsys.readouterr().err
+    assert main(["--only", "heldout", "-o", str(tmp_path / "o")]) == 2
+    assert "--data" in capsys.readouterr().err
     with pytest.raises(ReconError, match="no such file"):
         humaneva_joints(tmp_path / "humaneva15_train.npz")
+
+
+def test_hidden_entries_tell_the_k_of_bodies_of_known_k():
+    for bases in (1, 2, 3):
+        made = low_rank_tracks(60, 30, bases, 20.0, seed=bases)
+        record = run_clip(Clip2D("known", "walk", made.xy, 0.0, 0, hidden=True))
+        assert record["rank"] == record["best"] == bases
+        assert len(record["errors"]) == 9
+
+
+def test_a_turning_view_shows_every_side_of_a_still_body():
+    body = torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double().expand(40, 12, 3)
+    seen = turned_view(body, math.pi, 0.3)
+    height = seen[..., 1].amax(1) - seen[..., 1].amin(1)
+    assert float((height - 190).abs().max()) < 1e-6  # a level camera: heights stay
+    stack = (seen - seen.mean(1, keepdim=True)).mT.flatten(0, 1)
+    assert int((torch.linalg.svdvals(stack) > 1e-6).sum()) == 3  # a rigid body that turns
+    # half a turn is the mirror image from left to right
+    torch.testing.assert_close(seen[-1] * torch.tensor([-1.0, 1.0]), seen[0])
+
+
+def test_interval_of_a_mean_is_that_of_its_standard_error():
+    values = torch.randn(200, generator=torch.Generator().manual_seed(0)).tolist()
+    mean, low, high = bootstrap_mean(values)
+    assert low < mean < high
+    assert high - low == pytest.approx(2 * 1.96 / math.sqrt(200), rel=0.15)

@@ -1,9 +1,9 @@
 """Rates and coverage of every estimate: ``python -m eval.reliability [--data ../shared/data]``.
 
 Parts: ``rank`` (K by every rule over the grid of the specification, motions, gaps, the paper's closed form),
-``filling`` (gaps of a lost joint, by length). Without ``--data`` on the synthetic world alone. ``--smoke``: a small
-run that ends in a minute; ``--full``: the costly rules on the whole grid. Writes reliability.json, reliability.txt and
-reliability.png.
+``filling`` (gaps of a lost joint, by length), ``coverage`` (3D ellipsoids that hold the truth), ``heldout`` (K on real
+motion by hidden entries, degree by action; only with ``--data``). ``--smoke``: a small run that ends in a minute;
+``--full``: the costly rules on the whole grid. Writes reliability.json, reliability.txt and reliability.png.
 """
 
 from __future__ import annotations
@@ -18,13 +18,17 @@ import torch
 import yaml
 
 from eval.job import ROOT, provenance, write_json, write_text
+from eval.reliability.coverage import draw_coverage, measure_coverage
 from eval.reliability.filling import draw_filling, measure_filling
+from eval.reliability.heldout import draw_heldout, measure_heldout
 from eval.reliability.ranks import draw_ranks, measure_ranks
 from torchrecon.errors import ReconError
 
 __all__ = ["main"]
 
-PARTS = ("rank", "filling")
+PARTS = ("rank", "filling", "coverage", "heldout")
+_DRAW = {"rank": draw_ranks, "filling": draw_filling, "coverage": draw_coverage, "heldout": draw_heldout}
+_MEASURE = {"filling": measure_filling, "coverage": measure_coverage, "heldout": measure_heldout}
 _SMOKE = {
     "grid": {"frames": [50, 100], "points": [30], "trials": 1},
     "costly": {"trials": 1, "cells": [[50, 30, 2, 20.0], [100, 30, 3, 10.0]]},
@@ -33,6 +37,8 @@ _SMOKE = {
     "gaps": {"shares": [0.1], "trials": 1},
     "paper": {"trials": 2},
     "filling": {"films": 3, "lengths": [1, 5, 12]},
+    "coverage": {"sizes": [[60, 30, 2]], "snr": [20.0], "trials": 1, "public": 1, "public_snr": [20.0]},
+    "heldout": {"clips": 8},
 }
 
 
@@ -63,10 +69,7 @@ def _draw(result: dict[str, Any], path: Path) -> None:
 
     figure, axes = plt.subplots(1, len(result), figsize=(6.5 * len(result), 4.5), squeeze=False, layout="constrained")
     for ax, part in zip(axes[0], result, strict=True):
-        if part == "rank":
-            draw_ranks(result[part]["records"], ax)
-        else:
-            draw_filling(result[part]["records"], ax)
+        _DRAW[part](result[part]["records"], ax)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -91,12 +94,12 @@ def main(argv: list[str] | None = None) -> int:
     text: list[str] = []
     try:
         config = read_config(Path(arguments.config), arguments.smoke)
-        for part in arguments.only or PARTS:
+        for part in arguments.only or (PARTS if data is not None else PARTS[:-1]):
             at = time.perf_counter()
             if part == "rank":
                 result[part], lines = measure_ranks(config, arguments.full, arguments.workers)
             else:
-                result[part], lines = measure_filling(config, data, arguments.workers)
+                result[part], lines = _MEASURE[part](config, data, arguments.workers)
             title = f"== {part}{' (SMOKE)' if arguments.smoke else ''}, {time.perf_counter() - at:.0f} s =="
             text += [title, *lines, ""]
             # What is done is kept if a later part fails.

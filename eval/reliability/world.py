@@ -31,6 +31,7 @@ class LowRank:
     Attributes:
         xy: (frames, points, 2) pixels, with noise, in every frame.
         visible: (frames, points).
+        points3d: (frames, points, 3) the bodies without noise, camera axes, centred, pixels.
         sigma: standard deviation of the noise per coordinate, pixels.
         detectable: population eigenvalue of the weakest basis, noise included, over the limit ``1 + sqrt(d / n)``
             below which no rule sees it (Baik, Ben Arous and Peche 2005).
@@ -39,6 +40,7 @@ class LowRank:
 
     xy: Float[Tensor, "frames points 2"]
     visible: Bool[Tensor, "frames points"]
+    points3d: Float[Tensor, "frames points 3"]
     sigma: float
     detectable: float
     signal: float
@@ -105,7 +107,8 @@ def low_rank_tracks(
         angle = {"yaw": phase, "swing": math.radians(20) * torch.sin(phase), "static": 0 * phase}[motion]
         turn = torch.stack([0 * angle, angle, 0 * angle], -1)
     body = torch.einsum("kf,kap->fap", torch.cat(weights), shapes)
-    xy = _EXTENT * (rotation_from_vector(turn) @ body)[:, :2].mT
+    points3d = _EXTENT * (rotation_from_vector(turn) @ body).mT
+    xy = points3d[..., :2]
     sigma = float(xy.square().mean().sqrt()) * 10 ** (-snr / 20)
     level = torch.exp(frame_spread * torch.randn(frames, 1, 1, generator=g, dtype=torch.float64))
     noise = torch.randn(frames, points, 2, generator=g, dtype=torch.float64)
@@ -118,4 +121,4 @@ def low_rank_tracks(
         p, start, length = (int(torch.randint(high, (1,), generator=g)) for high in (points, frames, 13))
         visible[start : start + length + 3, p] = False
     place = _WANDER * smooth_curves(frames, 2, 2, g).T[:, None] + _CENTRE
-    return LowRank(xy + noise + place, visible, sigma, (1 + weakest) / (1 + edge), weakest / edge)
+    return LowRank(xy + noise + place, visible, points3d, sigma, (1 + weakest) / (1 + edge), weakest / edge)

@@ -53,6 +53,10 @@ def rank(options: argparse.Namespace) -> None:
     fields = {name: plain(getattr(estimate, name)) for name in RankEstimate.__dataclass_fields__}
     if options.out is not None:
         write_json(options.out, fields)
+    if options.figure is not None:
+        from torchrecon.viz.scree import draw_scree
+
+        draw_scree(estimate, options.figure)
     if options.json:
         _say(options, fields)
         return

@@ -33,6 +33,7 @@ def build_parser() -> argparse.ArgumentParser:
     _tracks(rank)
     rank.add_argument("-o", "--out", metavar="OUT.json", help="also write the result here")
     rank.add_argument("--rule", default="auto", metavar="NAME", help="rule (default: auto)")
+    rank.add_argument("--figure", metavar="FILE", help="also draw the eigenvalues and the noise edge (.png, .svg)")
     rank.add_argument("--layout", choices=["vector", "stack"], help="default: the rule's own")
 
     track = _command(commands, "track", "video to tracks with covariance and visibility")

@@ -10,11 +10,11 @@ The model is in ``shape_likelihood``; the search is derived here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
-from torchrecon.linalg import skew
 from torchrecon.linalg.noise_edge import difference_noise, marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, solve_items
@@ -23,8 +23,9 @@ from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
-from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
+from torchrecon.nrsfm.spread import SpreadParams, posterior_covariance, refitted, widened
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
@@ -38,6 +39,7 @@ class MarginalParams:
         upgrade: of the metric upgrade, which supplies the starts.
         descent: of the quasi-Newton descent.
         smoothing: of noisy tracks over time, before anything else.
+        spread: of the refits that tell how far the points may be off.
         coarse, fine: first and last standard deviation of the residual.
         finest: how far below ``fine`` the residual goes on falling while no new mode appears.
         levels: number of residual levels, geometric from coarse to fine (count).
@@ -57,6 +59,7 @@ class MarginalParams:
     upgrade: UpgradeParams = field(default_factory=UpgradeParams)
     descent: DescentParams = field(default_factory=DescentParams)
     smoothing: SmoothingParams = field(default_factory=SmoothingParams)
+    spread: SpreadParams = field(default_factory=SpreadParams)
     coarse: float = 0.1
     fine: float = 0.003
     finest: float = 0.0001
@@ -131,12 +134,12 @@ def solve_marginal(
         if small is not None:
             return _flat(data, rank, small).to(dtype=dtype)
     complete, centre = filled(data, params.fill_rank)
-    raw = _views(data, complete, params)
-    views = smoothed(raw, complete, params.smoothing)
+    measured = _views(data, complete, params)
+    views = smoothed(measured, complete, params.smoothing)
     asked = torch.is_grad_enabled() and (views.xy.requires_grad or views.noise.requires_grad)
     with torch.no_grad():
         fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
-        draws = 1.0 if views is raw else float(fixed.noise.mean() / raw.noise.mean())
+        draws = 1.0 if views is measured else float(fixed.noise.mean() / measured.noise.mean())
         model, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
         if asked:
             model = settled(fixed, model, eps)
@@ -144,6 +147,11 @@ def solve_marginal(
         model = attached(views, model, eps)
     answer = evaluate(views, model, eps, with_spread=True)
     assert answer.spread is not None
+    covariance = posterior_covariance(views, model, answer, eps)
+    if params.spread.draws:
+        smooth = partial(smoothed, params=params.smoothing)
+        errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)
+        covariance = widened(covariance, errors, params.spread.window)
     complaint = None if converged else "the likelihood still rose when the rounds of growth and descent were over"
     # What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in
     # pixels of the tracks in every frame.
@@ -156,7 +164,7 @@ def solve_marginal(
         rank=rank,
         complaint=complaint,
         summary=f"likeliest of {starts} starts, {model.loadings.shape[-1]} modes",
-        covariance3d=_covariance(views, model, answer, answer.spread[0], eps),
+        covariance3d=covariance,
     )
     return answered.to(dtype=dtype)
 
@@ -201,26 +209,6 @@ def _search(
         if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
             return model, eps, len(rotations), converged
         eps, level, before = eps * fall, level + 1, modes
-
-
-def _covariance(
-    views: Views, model: ShapeModel, answer: Evaluation, spread: Tensor, eps: float
-) -> Float[Tensor, "frames points 3 3"]:
-    """Of the points, camera axes: what weights, translation and poses leave, and the residual where it is not measured.
-
-    The family of shapes is taken as known, and the weights do not follow the pose: an approximation.
-    """
-    variance = (eps * model.scale[0]).square()
-    whitener = views.whitener(variance)
-    gain = torch.nn.functional.pad(variance[:, None, None, None] * (whitener.mT @ whitener), (0, 1, 0, 1))
-    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
-    points, fisher = answer.points[0], answer.pose_fisher[0]
-    size = fisher.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
-    ridge = 1e-6 * size + 1e-6 * size.amax()
-    root = torch.linalg.cholesky(torch.linalg.inv(fisher + ridge * torch.eye(4, dtype=eye.dtype, device=eye.device)))
-    moves = torch.cat([-skew(points), points[..., None]], -1) @ root[:, None]
-    both = torch.cat([spread, (eye - gain) @ moves], -1)
-    return both @ both.mT + variance[:, None, None, None] * (eye - gain)
 
 
 def _shapeless(data: Observations) -> Status | None:

@@ -10,6 +10,7 @@ from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.errors import ReconError
 from torchrecon.linalg.noise_edge import count_signals, spectrum
 from torchrecon.measurement import RankEstimate, Tracks
+from torchrecon.rank.band_limited import band_limited, motion_band
 from torchrecon.rank.base import (
     DIVISOR,
     Spectrum,
@@ -35,6 +36,7 @@ __all__ = ["RULES", "estimate_rank"]
 
 RULES = (
     "auto",
+    "band_limited",
     "paper",
     "mp",
     "tracy_widom",
@@ -62,14 +64,15 @@ def estimate_rank(
     """Number K of shape bases (the mean shape counted) that stand above the noise.
 
     K is what the data show: a basis whose effect is below the noise, or that the camera never sees move, is not
-    counted. ``auto`` takes ``kritchman_nadler`` where (enough) points are seen in all frames and
+    counted. ``auto`` takes ``band_limited`` where (enough) points are seen in all frames and
     ``cross_validation`` elsewhere; filled entries must not be given as measurements.
 
     Args:
         tracks: any batch shape; items are treated one by one.
-        rule: ``auto``; ``paper`` (eqs. 25-27 as printed: vector layout, given noise scale, needs covariance); ``mp``;
-            ``tracy_widom``; ``kritchman_nadler``; ``mdl``; ``gavish_donoho``; ``bootstrap`` (with an interval of its
-            own); ``cross_validation``.
+        rule: ``auto``; ``band_limited`` (``kritchman_nadler`` among the frequencies at which the tracks move; the
+            same where noise varies by frame); ``paper`` (eqs. 25-27 as printed: vector layout, given noise scale,
+            needs covariance); ``mp``; ``tracy_widom``; ``kritchman_nadler``; ``mdl``; ``gavish_donoho``; ``bootstrap``
+            (with an interval of its own); ``cross_validation``.
         layout: ``stack`` (2F x P, rank 3K under any motion) or ``vector`` (F x 2P, rank 6K only under rotation about
             three axes). Default: ``stack``, for ``paper`` ``vector``.
         noise_scale: ``estimate``: the covariance is right up to one factor; ``given``: it is right as it stands.
@@ -91,7 +94,7 @@ def estimate_rank(
         >>> xy = torch.einsum("fck,pk->fpc", a, b) + 0.1 * torch.randn(40, 30, 2, generator=g)
         >>> estimate = estimate_rank(Tracks(xy))
         >>> estimate.rank, estimate.deformation_degree, estimate.rule
-        (2, 2.0, 'kritchman_nadler')
+        (2, 2.0, 'band_limited')
     """
     if rule not in RULES:
         raise ReconError(f"rule: {rule!r} is not known; use one of {', '.join(RULES)}")
@@ -154,8 +157,8 @@ def _single(
     found = int(complete.sum())
     if rule == "auto":
         enough = found == tracks.points or (found >= _ENOUGH_POINTS and found >= _ENOUGH_SHARE * tracks.points)
-        rule = "kritchman_nadler" if enough else "cross_validation"
-        if rule == "kritchman_nadler" and found < tracks.points:
+        rule = "band_limited" if enough else "cross_validation"
+        if rule == "band_limited" and found < tracks.points:
             estimate = _spectral(tracks, rule, layout or "stack", noise_scale, max_rank, generator, [])
             # a count near the limit of few points says "at least"; the incomplete points know more
             if float(estimate.deformation_degree) * DIVISOR[estimate.layout] > 0.6 * (found - 1):
@@ -198,13 +201,21 @@ def _spectral(
     if covariance is not None:
         frame, point = covariance_scales(covariance)
     given, blocks = frame[:, None] * point, equal_blocks(xy)
+    noise = 1.0 if noise_scale == "given" else None
     if layout == "vector":
         blocks = blocks if covariance is None else covariance.mean(0)
         spectrum_ = vector_spectrum(xy, blocks, floor)
     elif rule in ("kritchman_nadler", "bootstrap") and noise_scale == "estimate":
         spectrum_, frame, point = kritchman_nadler(xy, frame, point, floor)
+    elif rule == "band_limited":
+        spectrum_, noise = band_limited(xy, frame, point, floor, noise)
     else:
         spectrum_ = stack_spectrum(xy, frame, point, floor)
+    if rule == "band_limited" and layout == "vector":
+        band = motion_band(whitened_vectors(xy, blocks)[:, None])
+        values, samples, _ = spectrum(band.kept)
+        spectrum_ = Spectrum(values, samples, layout, spectrum_.floor)
+        noise = band.noise if noise is None else noise
     divisor = DIVISOR[layout]
     if rule == "bootstrap":
         factor = torch.linalg.cholesky(equal_blocks(xy) if covariance is None else covariance)
@@ -215,9 +226,10 @@ def _spectral(
         count, eigenvalues, threshold = drawn.count, drawn.eigenvalues, drawn.threshold
         low, high = drawn.interval
     else:
-        count, eigenvalues, threshold = _count(spectrum_, rule, noise_scale, frames)
-        low = count_signals(spectrum_.values, spectrum_.samples, None, 0.999)[0]
-        high = count_signals(spectrum_.values, spectrum_.samples, None, 0.5)[0]
+        count, eigenvalues, threshold = _count(spectrum_, rule, noise, frames)
+        known = noise if rule == "band_limited" else None
+        low = count_signals(spectrum_.values, spectrum_.samples, known, 0.999)[0]
+        high = count_signals(spectrum_.values, spectrum_.samples, known, 0.5)[0]
     if layout == "stack" and rule != "paper":
         warnings += _static_view(xy, floor, count)
     if count >= 0.8 * len(eigenvalues) and rule != "paper":
@@ -264,13 +276,14 @@ def _round(count: int, divisor: int, max_rank: int | None) -> int:
     return rank if max_rank is None else min(rank, max_rank)
 
 
-def _count(spectrum_: Spectrum, rule: str, noise_scale: str, frames: int) -> tuple[int, Tensor, Tensor]:
+def _count(spectrum_: Spectrum, rule: str, noise: float | None, frames: int) -> tuple[int, Tensor, Tensor]:
     values, samples = spectrum_.values, spectrum_.samples
-    noise = 1.0 if noise_scale == "given" else None
     if rule == "paper":
         return paper_count(values, samples, frames)
     if rule == "kritchman_nadler":
         count, threshold = kritchman_nadler_count(spectrum_)
+    elif rule == "band_limited":
+        count, threshold = kritchman_nadler_count(spectrum_, noise=noise)
     elif rule == "mp":
         count, threshold = mp_count(values, samples, noise)
     elif rule == "tracy_widom":

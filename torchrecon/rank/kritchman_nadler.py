@@ -10,19 +10,19 @@ from torchrecon._typing import Float, Tensor
 from torchrecon.linalg.noise_edge import count_signals
 from torchrecon.rank.base import Spectrum, whitened_stack
 
-__all__ = ["kritchman_nadler", "kritchman_nadler_count"]
+__all__ = ["UNEQUAL", "kritchman_nadler", "kritchman_nadler_count", "shrunk"]
 
 # how many standard deviations the spread of the residuals has to exceed that of equal noise before it is believed
-_UNEQUAL = 3.0
+UNEQUAL = 3.0
 _STEP = 3
 _ROUNDS = 5
 # residual variances further than this from the common one are taken for accidents of a small matrix (log scale)
 _LOG_RANGE = 4.0
 
 
-def kritchman_nadler_count(spectrum: Spectrum, quantile: float = 0.95) -> tuple[int, Float[Tensor, " d"]]:
-    """Count leading eigenvalues above the edge of noise whose scale is estimated along the way."""
-    count, threshold = count_signals(spectrum.values, spectrum.samples, None, quantile)
+def kritchman_nadler_count(spectrum: Spectrum, *, noise: float | None = None) -> tuple[int, Float[Tensor, " d"]]:
+    """Count leading eigenvalues above the edge of noise whose scale is estimated along the way, or known."""
+    count, threshold = count_signals(spectrum.values, spectrum.samples, noise)
     threshold = threshold.clamp(min=spectrum.floor)
     above = (spectrum.values[:count] > threshold[:count]).tolist()
     return (above.index(False) if False in above else count), threshold
@@ -49,7 +49,7 @@ def kritchman_nadler(
     first = _spectrum(matrix, frame, point, floor)
     start, _ = kritchman_nadler_count(first)
     by_frame, by_point = _residual_factors(matrix, basis, start)
-    unequal = by_frame[0] > _UNEQUAL, by_point[0] > _UNEQUAL
+    unequal = by_frame[0] > UNEQUAL, by_point[0] > UNEQUAL
     if not any(unequal):
         return first, frame, point
     limit, signals = min(matrix.shape) - 2, 0
@@ -88,11 +88,11 @@ def _residual_factors(
     frames = scaled.shape[0] // 2
     dof_frame = free_row.view(frames, 2).sum(1) * (matrix.shape[1] - signals)
     dof_point = free_point * (matrix.shape[0] - signals)
-    return _shrunk(scaled.view(frames, 2, -1).mean((1, 2)), dof_frame), _shrunk(scaled.mean(0), dof_point)
+    return shrunk(scaled.view(frames, 2, -1).mean((1, 2)), dof_frame), shrunk(scaled.mean(0), dof_point)
 
 
-def _shrunk(variance: Tensor, dof: Tensor) -> tuple[float, Tensor]:
-    """z score of the spread of log variances, and standard deviations shrunk by empirical Bayes."""
+def shrunk(variance: Tensor, dof: Tensor) -> tuple[float, Tensor]:
+    """Score of the spread of log variances, and standard deviations shrunk by empirical Bayes."""
     log = variance.clamp(min=torch.finfo(variance.dtype).tiny).log()
     chance = torch.special.polygamma(1, dof.clamp(min=2.0) / 2)
     offset = log - log.mean()

@@ -1,0 +1,46 @@
+"""Covariances of 3D points: sized by refits."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from eval.reliability.coverage import squared_distances
+from eval.reliability.world import low_rank_tracks
+from torchrecon.measurement import Tracks
+from torchrecon.nrsfm.marginal import MarginalParams, solve_marginal
+from torchrecon.nrsfm.spread import SpreadParams, widened
+
+
+def _errors(spread: torch.Tensor, draws: int, seed: int = 0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    white = torch.randn(draws, *spread.shape[:-1], 1, generator=g)
+    return (torch.linalg.cholesky(spread) @ white)[..., 0]
+
+
+def test_widened_finds_the_covariance_that_the_errors_have() -> None:
+    g = torch.Generator().manual_seed(0)
+    stated = torch.randn(50, 20, 3, 3, generator=g)
+    stated = stated @ stated.mT + torch.eye(3)
+    mixed = torch.tensor([[2.0, 0.0, 0.0], [0.5, 1.5, 0.0], [0.3, -0.4, 3.0]])
+    root = torch.linalg.cholesky(stated) @ mixed
+    true = root @ root.mT
+    found = widened(stated, _errors(true, 40), window=50)
+    # in the metric of the truth, so that large and small axes count alike
+    ratio = torch.linalg.solve(true, found).diagonal(dim1=-2, dim2=-1).mean()
+    assert float(ratio) == pytest.approx(1, rel=0.05)
+    # nothing is made smaller by errors that happen to be small
+    calm = widened(stated, 0.1 * _errors(stated, 40), window=5)
+    torch.testing.assert_close(calm, stated, rtol=1e-6, atol=1e-6)
+
+
+def test_refits_make_the_closed_form_honest() -> None:
+    levels = []
+    for draws in (0, 4):
+        made = low_rank_tracks(40, 20, 1, 20.0, seed=3)
+        params = MarginalParams(spread=SpreadParams(draws=draws))
+        answer = solve_marginal(Tracks(made.xy), 1, torch.Generator().manual_seed(0), params)
+        distances = squared_distances(answer.points3d, answer.covariance3d, made.points3d)
+        levels.append(float(distances.mean()) / 3)
+    assert levels[0] > 2.5  # what the closed form states is too small by that factor in variance
+    assert 0.6 < levels[1] < 1.5

@@ -1,0 +1,149 @@
+"""How far the points of the marginal solver may be off: the posterior at the optimum, its size checked by refits.
+
+The posterior given the family of shapes is known in closed form. It leaves out that mean shape and modes were
+estimated from the same tracks, that their errors and those of the poses go together, and that what smoothing leaves of
+the noise lasts for several frames. A parametric bootstrap (Efron 1979) has all of that in it: noise is drawn again
+about the tracks that the answer predicts, and each draw is smoothed and fitted anew from the answer. A few draws do
+not give a covariance per point, but they tell well by how much the closed form is too small: per axis of the whitened
+errors, per frame and per point.
+What no draw can show is deformation that the model lacks: where the family of shapes does not hold, this is too small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+
+from torchrecon._typing import Float, Tensor
+from torchrecon.linalg import skew
+from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate
+
+__all__ = ["SpreadParams", "posterior_covariance", "refitted", "widened"]
+
+
+@dataclass(frozen=True)
+class SpreadParams:
+    """Parameters of the refits.
+
+    Attributes:
+        draws: of the noise; none leaves the closed form as it is (count).
+        steps: quasi-Newton steps of a refit (count).
+        window: half-width of the average over frames of a frame's factor (frames).
+    """
+
+    draws: int = 4
+    steps: int = 15
+    window: int = 4
+
+
+def posterior_covariance(
+    views: Views, model: ShapeModel, answer: Evaluation, eps: float
+) -> Float[Tensor, "frames points 3 3"]:
+    """Of the points, camera axes: what weights, translation and poses leave, and the residual where it is not measured.
+
+    The family of shapes is taken as known, and the weights do not follow the pose.
+
+    Args:
+        model, answer: batches of one, the answer with its ``spread``.
+    """
+    assert answer.spread is not None
+    spread = answer.spread[0]
+    variance = (eps * model.scale[0]).square()
+    whitener = views.whitener(variance)
+    gain = torch.nn.functional.pad(variance[:, None, None, None] * (whitener.mT @ whitener), (0, 1, 0, 1))
+    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+    points, fisher = answer.points[0], answer.pose_fisher[0]
+    size = fisher.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
+    ridge = 1e-6 * size + 1e-6 * size.amax()
+    root = torch.linalg.cholesky(torch.linalg.inv(fisher + ridge * torch.eye(4, dtype=eye.dtype, device=eye.device)))
+    moves = torch.cat([-skew(points), points[..., None]], -1) @ root[:, None]
+    both = torch.cat([spread, (eye - gain) @ moves], -1)
+    return both @ both.mT + variance[:, None, None, None] * (eye - gain)
+
+
+@torch.no_grad()
+def refitted(
+    measured: Views,
+    smooth: Callable[[Views, Tensor], Views],
+    model: ShapeModel,
+    answer: Evaluation,
+    eps: float,
+    generator: torch.Generator,
+    params: SpreadParams,
+    descent: DescentParams,
+) -> Float[Tensor, "draws frames points 3"]:
+    """Errors of refits to what the answer predicts with fresh noise; centred per frame, camera axes.
+
+    Args:
+        measured: views before they were smoothed.
+        smooth: what was done to them before the fit; takes the views, and the tracks without gaps.
+        model, answer: batches of one.
+    """
+    seen = measured.visible[..., None]
+    predicted = answer.points[0][..., :2] + answer.translation[0][:, None]
+    variance = measured.noise.diagonal(dim1=-2, dim2=-1)
+    slope = measured.noise[..., 1, 0] / variance[..., 0].clamp_min(torch.finfo(variance.dtype).tiny)
+    across = (variance[..., 1] - slope * measured.noise[..., 1, 0]).clamp_min(0).sqrt()
+    drawn = []
+    for _ in range(params.draws):
+        white = torch.randn(predicted.shape, generator=generator, dtype=predicted.dtype).to(predicted.device)
+        first = variance[..., 0].sqrt() * white[..., 0]
+        noise = torch.stack([first, slope * first + across * white[..., 1]], -1)
+        noisy = predicted + torch.where(seen, noise, noise.new_zeros(()))
+        drawn.append(smooth(Views(noisy, measured.visible, measured.noise), noisy))
+    views = Views(*(torch.stack([getattr(view, part.name) for view in drawn]) for part in fields(Views)))
+    start = ShapeModel(
+        *(getattr(model, part.name).expand(params.draws, *[-1] * (getattr(model, part.name).ndim - 1)).clone()
+          for part in fields(ShapeModel))
+    )  # fmt: skip
+    again, _, _ = descend(views, start, eps, params.steps, descent)
+    away = evaluate(views, again, eps).points - answer.points
+    return away - away.mean(-2, keepdim=True)
+
+
+def _average(values: Float[Tensor, "frames kinds"], half: int) -> Float[Tensor, "frames kinds"]:
+    """Mean over up to ``2 half + 1`` neighbouring frames."""
+    k = torch.arange(len(values), device=values.device)
+    total = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])
+    low, high = (k - half).clamp_min(0), (k + half + 1).clamp_max(len(values))
+    return (total[high] - total[low]) / (high - low)[:, None]
+
+
+def widened(
+    covariance: Float[Tensor, "frames points 3 3"], errors: Float[Tensor, "draws frames points 3"], window: int
+) -> Float[Tensor, "frames points 3 3"]:
+    """The covariance, made larger where the errors are larger than it says; never smaller.
+
+    One 3 x 3 factor for the sequence, then one for the image plane and one for depth in every frame and at every
+    point.
+
+    Example:
+        >>> import torch
+        >>> g = torch.Generator().manual_seed(0)
+        >>> level = torch.linspace(1, 3, 200, dtype=torch.float64)[:, None, None]
+        >>> errors = 2 * level * torch.randn(6, 200, 30, 3, generator=g, dtype=torch.float64)
+        >>> wide = widened(torch.eye(3, dtype=torch.float64).expand(200, 30, 3, 3), errors, 4)
+        >>> round(float(wide[:20, :, 2, 2].mean())), round(float(wide[-20:, :, 2, 2].mean()))
+        (5, 33)
+    """
+    # Exact tracks leave nothing open in the image; the ridge keeps the root of their covariance.
+    ridge = 1e-9 * covariance.detach().diagonal(dim1=-2, dim2=-1).mean(-1) + torch.finfo(covariance.dtype).tiny ** 0.5
+    root = torch.linalg.cholesky(covariance.detach() + torch.diag_embed(ridge[..., None].expand(*ridge.shape, 3)))
+    white = torch.linalg.solve_triangular(root, errors[..., None], upper=False)[..., 0]
+    common = torch.einsum("dfpi,dfpj->ij", white, white) / white[..., 0].numel()
+    values, vectors = torch.linalg.eigh(common)
+    common = vectors @ (values.clamp_min(1)[:, None] * vectors.mT)
+    factor = root @ torch.linalg.cholesky(common)
+    white = torch.linalg.solve_triangular(factor, errors[..., None], upper=False)[..., 0].square().mean(0)
+    power = torch.stack([white[..., :2].mean(-1), white[..., 2]], -1)
+    by_frame = _average(power.mean(1), window).clamp_min(torch.finfo(power.dtype).tiny)
+    by_point = (power / by_frame[:, None]).mean(0)
+    level = torch.stack([common.diagonal()[:2].mean(), common[2, 2]])
+    scale = torch.maximum(by_frame[:, None] * by_point, 1 / level).sqrt()
+    factor = scale[..., [0, 0, 1], None] * factor
+    # The factors stay constants where the covariance is differentiated.
+    change = factor @ torch.linalg.inv(root)
+    return change @ covariance @ change.mT
