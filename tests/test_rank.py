@@ -10,7 +10,7 @@ import torch
 from eval.reliability.ranks import mass_above
 from eval.reliability.world import low_rank_tracks
 from torchrecon.errors import ReconError
-from torchrecon.linalg.noise_edge import complement_basis, count_signals, spectrum, tracy_widom_edge
+from torchrecon.linalg.noise_edge import Complement, count_signals, spectrum, tracy_widom_edge
 from torchrecon.measurement import Tracks, stack_matrix, vector_matrix
 from torchrecon.rank import RULES, cross_validate, estimate_rank
 from torchrecon.rank.band_limited import motion_band
@@ -63,7 +63,7 @@ def test_eq25_26_whitened_eigenvalues_do_not_depend_on_how_the_points_are_scaled
     tracks = Tracks(xy, covariance=covariance.expand(150, 20, 2, 2))
     estimate = estimate_rank(tracks, "tracy_widom", layout="vector", noise_scale="given")
     # the printed order: centre with Helmert rows, then C -> T C T^T, then the eigenvalues of R C^-1
-    t = complement_basis(torch.ones(20)).T
+    t = Complement(torch.ones(20)).up(torch.eye(19))
     helmert = torch.block_diag(t, t)
     c = torch.cat([torch.cat([torch.diag(covariance[:, a, b]) for b in (0, 1)], 1) for a in (0, 1)], 0)
     x = vector_matrix(xy) @ helmert.T

@@ -15,7 +15,7 @@ import torch
 from torchrecon._typing import Bool, Float, Tensor
 
 __all__ = [
-    "complement_basis",
+    "Complement",
     "count_signals",
     "difference_noise",
     "kritchman_nadler_noise",
@@ -28,23 +28,37 @@ __all__ = [
 TRACY_WIDOM = {0.5: -1.2686, 0.95: 0.9793, 0.995: 2.4224, 0.999: 3.2724}
 
 
-def complement_basis(vector: Float[Tensor, " dim"]) -> Float[Tensor, "dim dim-1"]:
-    """Orthonormal columns that are orthogonal to ``vector``; for a constant vector it is a Helmert-like centring.
+class Complement:
+    """Orthonormal coordinates of everything orthogonal to a vector: a mirror that is never formed as a matrix.
+
+    For a constant vector it is a Helmert-like centring.
 
     Example:
         >>> import torch
-        >>> basis = complement_basis(torch.ones(4, dtype=torch.float64))
-        >>> bool((basis.T @ basis - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-12)
+        >>> ones = torch.ones(4, dtype=torch.float64)
+        >>> basis = Complement(ones).up(torch.eye(3, dtype=torch.float64))
+        >>> torch.allclose(basis @ basis.T, torch.eye(3, dtype=torch.float64))
+        True
+        >>> float((basis @ ones).abs().max()) < 1e-12
         True
     """
-    unit = vector / vector.norm()
-    mirror = unit.clone()
-    mirror[0] += 1.0 if float(unit[0]) >= 0 else -1.0
-    full = torch.eye(len(unit), dtype=unit.dtype, device=unit.device) - 2 * torch.outer(mirror, mirror) / mirror.dot(
-        mirror
-    )
-    basis: Tensor = full[:, 1:]
-    return basis
+
+    def __init__(self, vector: Float[Tensor, " dim"]) -> None:
+        unit = vector / vector.norm()
+        self.share: Float[Tensor, " dim"] = 1 - unit.square()
+        """Squared length of each axis of the space within the complement."""
+        self._mirror = unit.clone()
+        self._mirror[0] += 1.0 if float(unit[0]) >= 0 else -1.0
+        self._mirror /= self._mirror.norm()
+
+    def down(self, rows: Float[Tensor, "*rows dim"]) -> Float[Tensor, "*rows inner"]:
+        """Rows in these coordinates."""
+        return (rows - 2 * (rows @ self._mirror)[..., None] * self._mirror)[..., 1:]
+
+    def up(self, rows: Float[Tensor, "*rows inner"]) -> Float[Tensor, "*rows dim"]:
+        """Back to the space; what :meth:`down` dropped is zero."""
+        rows = torch.nn.functional.pad(rows, (1, 0))
+        return rows - 2 * (rows @ self._mirror)[..., None] * self._mirror
 
 
 def spectrum(matrix: Float[Tensor, "rows cols"]) -> tuple[Float[Tensor, " d"], int, int]:

@@ -12,9 +12,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
+
 from torchrecon._typing import Float, Tensor
-from torchrecon.linalg.dct import dct_basis
-from torchrecon.linalg.noise_edge import count_signals, spectrum
+from torchrecon.linalg.dct import dct, dct_share, inverse_dct
+from torchrecon.linalg.noise_edge import Complement, count_signals, spectrum
 from torchrecon.rank.base import Spectrum, stack_spectrum, whitened_stack
 from torchrecon.rank.kritchman_nadler import UNEQUAL, kritchman_nadler, shrunk
 
@@ -76,8 +78,7 @@ def motion_band(rows: Float[Tensor, "frames parts cols"], params: BandParams | N
     """
     p = params or BandParams()
     frames, parts, cols = rows.shape
-    basis = dct_basis(frames, frames, dtype=rows.dtype, device=rows.device)
-    moved = (basis.mT @ rows.flatten(1)).view_as(rows)
+    moved = dct(rows)
     band = frames
     while True:
         smaller = int(band / p.step)
@@ -93,12 +94,12 @@ def motion_band(rows: Float[Tensor, "frames parts cols"], params: BandParams | N
             if float(lost.square().mean()) > (1 + p.excess * chance) * float(before.square().mean()):
                 break
         band = smaller
-    above, high = moved[band:], basis[:, band:]
-    free = high.square().sum(1)
+    above = moved[band:]
+    free = 1 - dct_share(frames, band).to(rows)
     kept = moved[:band].flatten(0, 1)
     if len(above) * parts < p.enough * cols:
         return MotionBand(kept, None, free, None)
-    quiet = (high @ above.flatten(1)).view_as(rows)
+    quiet = inverse_dct(torch.cat([torch.zeros_like(moved[:band]), above]))
     return MotionBand(kept, quiet, free, float(above.square().mean()))
 
 
@@ -119,14 +120,14 @@ def band_limited(
         noise: variance that ``frame`` and ``point`` leave, where it is known.
     """
     if float(frame.max()) < _EQUAL_FRAMES * float(frame.min()):
-        matrix, basis = whitened_stack(xy, frame, point)
+        matrix, space = whitened_stack(xy, frame, point)
         band = motion_band(matrix.unflatten(0, (len(xy), 2)))
         by_frame, by_point = (0.0, frame), (0.0, point)
         if noise is None and band.quiet is not None:
-            by_frame, by_point = _residual_factors(band.quiet, band.free, basis)
+            by_frame, by_point = _residual_factors(band.quiet, band.free, space)
         if by_point[0] > UNEQUAL:
             point = point * by_point[1]
-            matrix, basis = whitened_stack(xy, frame, point)
+            matrix, space = whitened_stack(xy, frame, point)
             band = motion_band(matrix.unflatten(0, (len(xy), 2)))
         values, samples, _ = spectrum(band.kept)
         result = Spectrum(values, samples, "stack", floor / float((frame.min() * point.min()) ** 2))
@@ -141,10 +142,11 @@ def band_limited(
     return kritchman_nadler(xy, frame, point, floor)[0], None
 
 
-def _residual_factors(quiet: Tensor, free: Tensor, basis: Tensor) -> tuple[tuple[float, Tensor], tuple[float, Tensor]]:
+def _residual_factors(
+    quiet: Tensor, free: Tensor, space: Complement
+) -> tuple[tuple[float, Tensor], tuple[float, Tensor]]:
     """For frames and for points: how unequal the noise above the band is (a z score), and factors to divide by."""
-    squared = (quiet @ basis.T).square()
-    share = basis.square().sum(1)
+    squared, share = space.up(quiet).square(), space.share
     parts, cols = quiet.shape[1:]
     by_frame = shrunk(squared.mean((1, 2)) / free, parts * cols * free)
     return by_frame, shrunk(squared.mean((0, 1)) / share, parts * float(free.sum()) * share)

@@ -8,7 +8,7 @@ import torch
 
 from torchrecon._typing import Float, Tensor
 from torchrecon.errors import ReconError
-from torchrecon.linalg.noise_edge import complement_basis, spectrum
+from torchrecon.linalg.noise_edge import Complement, spectrum
 from torchrecon.measurement import Tracks, stack_matrix, vector_matrix
 
 __all__ = [
@@ -70,18 +70,18 @@ def covariance_scales(
 
 def whitened_stack(
     xy: Float[Tensor, "frames points 2"], frame: Float[Tensor, " frames"], point: Float[Tensor, " points"]
-) -> tuple[Float[Tensor, "rows cols"], Float[Tensor, "points cols"]]:
+) -> tuple[Float[Tensor, "rows cols"], Complement]:
     """The 2F x (P-1) stack whose entries have equal noise, without translation.
 
     The translation of a frame multiplies ones; after division by the points' factors it multiplies ``1 / point``, so
     the complement of that vector is kept, which leaves the noise white (a plain mean would not).
 
     Returns:
-        (matrix, basis): the matrix and the orthonormal columns that map it back to points.
+        (matrix, space): the matrix and the coordinates of its columns, which lead back to points.
     """
     stack = stack_matrix(xy) / frame.repeat_interleave(2)[:, None] / point
-    basis = complement_basis(1 / point)
-    return stack @ basis, basis
+    space = Complement(1 / point)
+    return space.down(stack), space
 
 
 def stack_spectrum(xy: Float[Tensor, "frames points 2"], frame: Tensor, point: Tensor, floor: float) -> Spectrum:

@@ -7,7 +7,7 @@ import math
 import torch
 
 from torchrecon._typing import Float, Tensor
-from torchrecon.linalg.noise_edge import count_signals
+from torchrecon.linalg.noise_edge import Complement, count_signals
 from torchrecon.rank.base import Spectrum, whitened_stack
 
 __all__ = ["UNEQUAL", "kritchman_nadler", "kritchman_nadler_count", "shrunk"]
@@ -45,22 +45,22 @@ def kritchman_nadler(
     Returns:
         (spectrum, frame, point): the whitened spectrum, and the standard deviations that whitened it.
     """
-    matrix, basis = whitened_stack(xy, frame, point)
+    matrix, space = whitened_stack(xy, frame, point)
     first = _spectrum(matrix, frame, point, floor)
     start, _ = kritchman_nadler_count(first)
-    by_frame, by_point = _residual_factors(matrix, basis, start)
+    by_frame, by_point = _residual_factors(matrix, space, start)
     unequal = by_frame[0] > UNEQUAL, by_point[0] > UNEQUAL
     if not any(unequal):
         return first, frame, point
     limit, signals = min(matrix.shape) - 2, 0
     while True:
         for attempt in range(_ROUNDS + 1):
-            matrix, basis = whitened_stack(xy, frame, point)
+            matrix, space = whitened_stack(xy, frame, point)
             result = _spectrum(matrix, frame, point, floor)
             count, _ = kritchman_nadler_count(result)
             if (attempt and count <= signals) or attempt == _ROUNDS:
                 break
-            by_frame, by_point = _residual_factors(matrix, basis, signals)
+            by_frame, by_point = _residual_factors(matrix, space, signals)
             frame = frame * by_frame[1] if unequal[0] else frame
             point = point * by_point[1] if unequal[1] else point
         if count <= signals or signals >= limit:
@@ -75,15 +75,15 @@ def _spectrum(matrix: Tensor, frame: Tensor, point: Tensor, floor: float) -> Spe
 
 
 def _residual_factors(
-    matrix: Float[Tensor, "rows cols"], basis: Float[Tensor, "points cols"], signals: int
+    matrix: Float[Tensor, "rows cols"], space: Complement, signals: int
 ) -> tuple[tuple[float, Tensor], tuple[float, Tensor]]:
     """For frames and for points: how unequal the residual of a fit is (a z score), and the factors to divide by."""
     u, s, vh = torch.linalg.svd(matrix, full_matrices=False)
-    u, v = u[:, :signals], basis @ vh[:signals].T
-    residual2 = ((matrix - u @ (s[:signals, None] * vh[:signals])) @ basis.T) ** 2
+    u, v = u[:, :signals], space.up(vh[:signals]).T
+    residual2 = space.up(matrix - u @ (s[:signals, None] * vh[:signals])) ** 2
     # entries that the fit can follow have smaller residuals; 5 % keeps a point that is fitted exactly finite
     free_row = (1 - (u**2).sum(1)).clamp(min=0.05)
-    free_point = ((basis**2).sum(1) - (v**2).sum(1)).clamp(min=0.05)
+    free_point = (space.share - (v**2).sum(1)).clamp(min=0.05)
     scaled = residual2 / free_row[:, None] / free_point
     frames = scaled.shape[0] // 2
     dof_frame = free_row.view(frames, 2).sum(1) * (matrix.shape[1] - signals)
