@@ -110,9 +110,9 @@ def whitened_vectors(
     white = torch.linalg.solve_triangular(factor, xy[..., None], upper=False)[..., 0]
     # what a translation in u and one in v look like after whitening; their complement carries no translation
     moved = torch.linalg.solve_triangular(factor, equal_blocks(xy), upper=False)
-    translation = torch.stack([moved[:, :, axis].T.flatten() for axis in (0, 1)], -1)
-    full, _ = torch.linalg.qr(translation, mode="complete")
-    return vector_matrix(white) @ full[:, 2:]
+    along_u, along_v = (moved[:, :, axis].T.flatten() for axis in (0, 1))
+    first = Complement(along_u)
+    return Complement(first.down(along_v)).down(first.down(vector_matrix(white)))
 
 
 def vector_spectrum(
