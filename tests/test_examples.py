@@ -41,7 +41,7 @@ def test_quickstart_writes_a_shape_near_the_truth_and_its_files(tmp_path, capsys
 
 
 def test_own_video_makes_a_page_and_explains_the_tracks(tmp_path, capsys):
-    rec = load("own_video").main(None, tmp_path / "out", frames=13, size=(240, 320), solver="rigid")
+    rec = load("own_video").main(None, tmp_path / "out", frames=13, size=(300, 400), solver="rigid")
     assert float(capsys.readouterr().out.split("error ")[1].split()[0]) < 1.0  # pixels
     assert rec.points3d.shape[0] == 13
     assert (tmp_path / "out" / "report.html").read_text().rstrip().endswith("</html>")
