@@ -9,22 +9,9 @@ from __future__ import annotations
 import torch
 
 from torchrecon._typing import Float, Tensor
+from torchrecon.models.joints import JOINTS, MIRROR, PARENTS
 
 __all__ = ["JOINTS", "MIRROR", "PARENTS", "forward_kinematics", "joint", "rotation_x", "rotation_y", "rotation_z"]
-
-JOINTS = (
-    "pelvis", "spine", "chest", "neck", "head",
-    "l_shoulder", "l_elbow", "l_wrist", "l_hand",
-    "r_shoulder", "r_elbow", "r_wrist", "r_hand",
-    "l_hip", "l_knee", "l_ankle", "l_toe",
-    "r_hip", "r_knee", "r_ankle", "r_toe",
-)  # fmt: skip
-PARENTS = (-1, 0, 1, 2, 3, 3, 5, 6, 7, 3, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)
-_OTHER = {"l": "r", "r": "l"}
-MIRROR = tuple(
-    JOINTS.index(_OTHER[name[0]] + name[1:]) if name[1] == "_" else index for index, name in enumerate(JOINTS)
-)
-"""Index of the joint on the other side of the body."""
 
 
 def joint(name: str) -> int:
