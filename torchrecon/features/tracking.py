@@ -68,8 +68,8 @@ class TrackerParams:
     iterations: int = 6
     alpha: float = 0.8
     detect_every: int = 1
-    max_tracks: int = 400
-    min_distance: float = 4.0
+    max_tracks: int = 600
+    min_distance: float = 3.0
     min_length: int = 5
     mask_margin: float = 2.0
     min_correlation: float = 0.7
