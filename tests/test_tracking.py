@@ -201,6 +201,18 @@ def test_alignment_recovers_translation_and_affine_deformation():
     assert float(score.min()) > 0.99
 
 
+def test_a_window_that_collapsed_leaves_the_others_alone():
+    image = image_pyramid(_texture(120, 140), 1)[0]
+    xy = torch.tensor([[60.0, 50.0], [80.0, 70.0]])
+    templates = make_templates(image, xy, 5)
+    warp = identity_warp(2, xy)
+    alone = align_window(templates.select(torch.tensor([1])), image, xy[1:] + 0.6, warp[1:], 5)
+    warp[0, :, :2] = torch.tensor([[1.0, 2.0], [0.5, 1.0]])  # a line: not to be inverted
+    both = align_window(templates, image, xy + 0.6, warp, 5)
+    torch.testing.assert_close(both[0][1], alone[0][0])
+    assert float(both[2][1]) > 0.99 > float(both[2][0])
+
+
 def test_window_on_a_turning_cylinder_keeps_its_centre():
     """Closed form: a point at angle p of a cylinder of radius R is seen at R sin(p), turned by t at R sin(p + t)."""
     radius, turn = 24.0, math.radians(25.0)

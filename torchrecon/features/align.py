@@ -262,7 +262,10 @@ def align_window(
             step = (templates.slide @ residual()[1][..., None])[..., 0].clamp(-half / 2, half / 2)
             centre = centre - (affine @ step[..., None])[..., 0]
             continue
-        back = torch.linalg.solve(affine, bent).flatten(-2) * half  # the step that would straighten the window
+        # The step that would straighten the window; a window that has collapsed to a line has none, and its stretch
+        # rules it out.
+        back = torch.linalg.solve_ex(affine, bent)[0].flatten(-2) * half
+        back = torch.where(torch.isfinite(back), back, torch.zeros_like(back))
         step = templates.pull @ residual()[1][..., None] + templates.unbend @ back[..., None]
         step = step[..., 0].clamp(-half / 2, half / 2)
         change = step[:, :10].reshape(-1, 2, 5) / half
