@@ -11,7 +11,7 @@ from torchrecon.errors import ReconError
 from torchrecon.measurement import FilledTracks, Tracks
 from torchrecon.statespace import best_tracking_index
 
-__all__ = ["Gaps", "Guess", "assemble", "gap_lengths", "neighbour_covariance", "open_gaps"]
+__all__ = ["Gaps", "Guess", "assemble", "gap_lengths", "neighbour_covariance", "open_gaps", "whole_gaps"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +67,23 @@ def gap_lengths(visible: Bool[Tensor, "frames points"]) -> Int[Tensor, "frames p
     """
     before, after = _neighbours(visible)
     return torch.where(visible, 0, after - before - 1)
+
+
+def whole_gaps(
+    entries: Bool[Tensor, "frames points"], visible: Bool[Tensor, "frames points"]
+) -> Bool[Tensor, "frames points"]:
+    """Every entry of the gaps in which at least one of ``entries`` lies.
+
+    Example:
+        >>> import torch
+        >>> visible = torch.tensor([[True], [False], [False], [True], [False]])
+        >>> whole_gaps(torch.tensor([[False], [False], [True], [False], [False]]), visible)[:, 0].tolist()
+        [False, True, True, False, False]
+    """
+    gap = torch.where(visible, 0, _neighbours(visible)[0] + 2)
+    any_of_gap = torch.zeros(len(visible) + 2, visible.shape[1], dtype=torch.uint8, device=visible.device)
+    any_of_gap = any_of_gap.scatter_reduce(0, gap, entries.to(torch.uint8), "amax")
+    return any_of_gap.gather(0, gap).bool() & ~visible
 
 
 def neighbour_covariance(

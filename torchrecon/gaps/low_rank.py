@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchrecon._typing import Bool, Float, Int, Tensor
-from torchrecon.gaps.base import Gaps, Guess
+from torchrecon.gaps.base import Gaps, Guess, whole_gaps
 from torchrecon.gaps.rts import fill_rts
 from torchrecon.linalg.missing_factors import FactorModel, fit_factors, grow_factors, start_factors
 
@@ -26,7 +26,8 @@ class LowRankParams:
         iterations: of the completion at each rank, at most.
         tolerance: stop when no filled value moves further than this, pixels.
         missing: largest share of unseen entries in a window.
-        disagree: distance between two fillers that makes a value doubtful, pixels.
+        disagree: distance between two fillers, or error on the gaps cut for a test, from which on a gap is doubtful,
+            pixels.
         bases: K of the sequence model, at most.
         decoys: gaps that are cut beside each real one to choose a filler (count).
         tested: share of a point's observations that such gaps may take.
@@ -38,7 +39,7 @@ class LowRankParams:
     iterations: int = 15
     tolerance: float = 0.02
     missing: float = 0.35
-    disagree: float = 5.0
+    disagree: float = 2.5
     bases: int = 4
     decoys: int = 12
     tested: float = 0.1
@@ -56,8 +57,9 @@ def fill_low_rank(gaps: Gaps, params: LowRankParams | None = None, choose: bool 
     the whole sequence; and the smoother. How far to trust them is measured on the sequence itself: gaps of the same
     length are cut into the same points beside the real ones. For each class of lengths the candidate, or the mean of
     two, that predicts those best is taken, with its mean squared error as the variance; without ``choose`` it is the
-    completion (where the size allows it). The completion raises the rank step by step, because a high rank from the
-    start can reproduce any first guess.
+    completion (where the size allows it). A gap is doubtful as a whole where another candidate disagrees anywhere in
+    it: where the fillers cross they agree by chance. The completion raises the rank step by step, because a high rank
+    from the start can reproduce any first guess.
 
     Everything before the first and after the last observation of a point comes from the sequence model and is always
     doubtful.
@@ -92,7 +94,8 @@ def fill_low_rank(gaps: Gaps, params: LowRankParams | None = None, choose: bool 
             winner = int(errors2[:, tested].mean(1).argmin()) if choose else winner
             error2 = float(errors2[winner, tested].mean())
         apart2 = ((candidates[:single] - candidates[winner]) ** 2).sum(-1).sort(0).values[int(winner < single)]
-        unsure = (apart2 > params.disagree**2) | (error2 > params.disagree**2) | (not tested.any())
+        unsure = whole_gaps(apart2 > params.disagree**2, gaps.visible)
+        unsure |= (error2 > params.disagree**2) | (not tested.any())
         xy = torch.where(target[..., None], candidates[winner], xy)
         profile = depth / depth[target].mean() if target.any() else depth
         growth = torch.where(target, error2 * profile, growth)
