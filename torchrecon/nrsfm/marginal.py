@@ -139,7 +139,8 @@ def solve_marginal(
     asked = torch.is_grad_enabled() and (views.xy.requires_grad or views.noise.requires_grad)
     with torch.no_grad():
         fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
-        draws = 1.0 if views is measured else float(fixed.noise.mean() / measured.noise.mean())
+        # Tracks that show more than one basis have modes: only a body that may be rigid has to prove them.
+        draws = 1.0 if views is measured or rank > 1 else float(fixed.noise.mean() / measured.noise.mean())
         model, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
         if asked:
             model = settled(fixed, model, eps)
@@ -237,7 +238,7 @@ def marginal(
 
     Args:
         tracks: seen entries only are read; a covariance is used where there is one.
-        rank: what the result reports; without a covariance it also tells signal from noise in the start.
+        rank: what the result reports; with one basis the first mode has to stand above what noise does to a rigid body.
         generator: starts of the metric upgrade.
 
     Example:
