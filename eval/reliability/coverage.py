@@ -88,8 +88,7 @@ def run_sequence(item: Sequence3D) -> dict[str, Any]:
         sigma = truth[..., :2].square().mean().sqrt() * 10 ** (-item.snr / 20)
         noise = torch.randn(truth[..., :2].shape, generator=generator, dtype=truth.dtype)
         xy = truth[..., :2] + sigma * noise
-    # Every solver gets the same rank; the default one does not use it.
-    answer = tr.reconstruct(tr.Tracks(xy), rank=2)
+    answer = tr.reconstruct(tr.Tracks(xy))
     distances = squared_distances(answer.points3d, answer.covariance3d, truth)
     return {
         "source": item.source,
