@@ -2,8 +2,9 @@
 
 Starts come from metric upgrades with several numbers of bases. From each, the residual of the model falls from coarse
 to fine; at every level one step of expectation-maximisation lets new modes in where the tracks ask for them, and a
-preconditioned quasi-Newton descent follows the likelihood. The likeliest start is carried through. No K is needed:
-the reported rank is the caller's. Complete and incomplete tracks, with or without covariance, one objective.
+preconditioned quasi-Newton descent follows the likelihood. The likeliest start is carried through. No K is needed: the
+rank that is reported decides only whether the first mode has to prove itself against the noise (K = 1). Complete and
+incomplete tracks, with or without covariance, one objective.
 The model is in ``shape_likelihood``; the search is derived here.
 """
 
