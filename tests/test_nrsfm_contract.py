@@ -12,6 +12,7 @@ from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Reconstruction, Tracks
 from torchrecon.metrics import error3d_camera
 from torchrecon.nrsfm import SOLVERS, get_solver
+from torchrecon.nrsfm.base import mirror_sign
 from torchrecon.nrsfm.lowrank import LowRankParams, solve_complete
 
 COMPLETE_ONLY = {"bmm", "logdet", "pta"}
@@ -166,6 +167,28 @@ def test_frames_and_points_that_show_nothing_are_bridged(hidden):
     rec = get_solver("auto")(Tracks(truth[..., :2], visible), 1)
     assert bool(torch.isfinite(rec.points3d).all())
     assert error3d_camera(rec.points3d, truth, visible) < 0.02
+
+
+@pytest.mark.parametrize("name", ["auto", "csf", "em_ppca", "marginal", "pnd2"])
+def test_empty_frames_are_bridged_between_their_neighbours_and_their_covariance_says_so(name):
+    truth = _world()
+    empty = [0, 1, 2, 3, 18, 19, 20]
+    visible = torch.ones(40, 20, dtype=torch.bool)
+    visible[empty] = False
+    noisy = truth[..., :2] + 0.1 * torch.randn(40, 20, 2, generator=torch.Generator().manual_seed(1))
+    rec = get_solver(name)(Tracks(noisy, visible), 1)
+    assert rec.status.code == "ok", rec.status.text
+    assert "7 of 40 frames show nothing and are bridged" in rec.status.text
+    assert error3d_camera(rec.points3d, truth, visible) < 0.02
+    assert mirror_sign(rec.points3d) == 1
+    torch.testing.assert_close(rec.points3d[0], rec.points3d[4])  # held before the first frame that shows something
+    same_mirror = min((rec.points3d, rec.mirrored().points3d), key=lambda p: float((p - truth).norm()))
+    assert float((same_mirror - truth)[18:21].norm() / truth[18:21].norm()) < 0.05
+    if rec.covariance3d is not None:
+        size = rec.covariance3d.diagonal(dim1=-2, dim2=-1).mean((1, 2))
+        assert bool((size[:4].diff() < 0).all())
+        assert float(size[19]) > float(size[18]) > 5 * float(size[17])
+        assert 0.3 < float(size[0] / ((rec.points3d[0] - rec.points3d[8]).square().mean())) < 3
 
 
 @pytest.mark.parametrize("name", ["auto", "marginal"])

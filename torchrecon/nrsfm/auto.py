@@ -7,6 +7,7 @@ import torch
 from torchrecon._typing import Bool, Int, Tensor
 from torchrecon.measurement import Reconstruction, Tracks
 from torchrecon.nrsfm.base import solve_items
+from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.dense import DenseParams, solve_dense
 from torchrecon.nrsfm.marginal import solve_marginal
 from torchrecon.nrsfm.trajectory import solve_trajectories
@@ -48,6 +49,10 @@ def auto(
 def _solve_one(item: Tracks, rank: int, generator: torch.Generator) -> Reconstruction:
     if item.intrinsics is not None or not meet(item.visible):
         return solve_trajectories(item, rank, generator)
+    return bridging(_in_windows)(item, rank, generator)
+
+
+def _in_windows(item: Tracks, rank: int, generator: torch.Generator) -> Reconstruction:
     if item.frames > WindowParams().longest:
         return solve_windows(item, rank, generator, _together)
     return _together(item, rank, generator)

@@ -98,7 +98,7 @@ def conclude(
         status = Status(
             "undetermined",
             f"{1 - linked:.0%} of the pairs of frames share fewer than {MIN_POINTS} points; the cameras of this method "
-            "need tracks that last, use solver 'auto'",
+            "need tracks that last, use solver 'trajectory'",
         )
     if status is None and complaint is not None:
         status = Status("not_converged", complaint)

@@ -22,6 +22,7 @@ from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import nearest_rotation
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import STATIC_TURN, filled
 from torchrecon.nrsfm.observations import observe
 from torchrecon.nrsfm.pnd2 import Pnd2Params, first_views, fit_procrustean, rigid_start
@@ -234,4 +235,4 @@ def consensus(
         >>> bool((rec.reproject() - truth[..., :2]).abs().max() < 1e-3), rec.status.code
         (True, 'ok')
     """
-    return solve_items(tracks, rank, solve_consensus, generator)
+    return solve_items(tracks, rank, bridging(solve_consensus), generator)

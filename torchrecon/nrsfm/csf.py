@@ -24,6 +24,7 @@ from torchrecon.linalg.dct import dct_basis
 from torchrecon.linalg.gauss_newton import damped_gauss_newton
 from torchrecon.measurement import Reconstruction, Tracks
 from torchrecon.nrsfm.base import solve_items
+from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import GramParams, gram_upgrade
 from torchrecon.nrsfm.observations import Observations, observe
@@ -178,4 +179,4 @@ def csf(
         >>> bool((rec.reproject() - (shape @ turn.mT)[..., :2]).abs().max() < 1e-3), rec.status.code
         (True, 'ok')
     """
-    return solve_items(tracks, rank, _solve, generator)
+    return solve_items(tracks, rank, bridging(_solve), generator)

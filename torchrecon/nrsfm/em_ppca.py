@@ -22,6 +22,7 @@ from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Reconstruction, Tracks
 from torchrecon.nrsfm.base import solve_items
+from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import GramParams, gram_upgrade
 from torchrecon.nrsfm.observations import Observations, observe
@@ -199,4 +200,4 @@ def em_ppca(
         >>> bool((rec.reproject() - (shape @ turn.mT)[..., :2]).abs().max() < 1e-3), rec.status.code
         (True, 'ok')
     """
-    return solve_items(tracks, rank, _solve, generator)
+    return solve_items(tracks, rank, bridging(_solve), generator)

@@ -19,6 +19,7 @@ from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg.noise_edge import difference_noise, marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, solve_items
+from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.implicit import attached, settled
@@ -251,4 +252,4 @@ def marginal(
         >>> marginal(Tracks((shape @ turn.mT)[..., :2]), 1).points3d.shape
         torch.Size([15, 12, 3])
     """
-    return solve_items(tracks, rank, solve_marginal, generator)
+    return solve_items(tracks, rank, bridging(solve_marginal), generator)

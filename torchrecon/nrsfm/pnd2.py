@@ -23,6 +23,7 @@ from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, looks_static, mirror_sign, solve_items, turn_of_view
+from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import STATIC_TURN, filled
 from torchrecon.nrsfm.observations import observe
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
@@ -356,4 +357,4 @@ def pnd2(
         >>> bool((rec.reproject() - truth[..., :2]).abs().max() < 1e-3), rec.status.code
         (True, 'ok')
     """
-    return solve_items(tracks, rank, solve_pnd2, generator)
+    return solve_items(tracks, rank, bridging(solve_pnd2), generator)
