@@ -169,6 +169,17 @@ def test_eq17_auto_box_finds_the_person_before_a_wall() -> None:
     assert float((depth_cluster(depth) & person).sum() / person.sum()) > 0.95
 
 
+def test_eq17_an_arm_before_the_trunk_is_the_body_and_a_wall_in_the_mask_is_not() -> None:
+    depth = torch.full((120, 160), 5.0)
+    depth[30:110, 60:100] = 3.0
+    depth[50:60, 40:120] = 2.6  # nearer by more than a step: a surface of its own
+    mask = depth < 4
+    mask[:20, :30] = True  # too much of a mask: the wall
+    cloud = backproject(depth[None, None], torch.tensor([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]]))[0]
+    found = range_box(cloud.permute(1, 2, 0), *auto_box(cloud, mask)) & mask
+    assert torch.equal(found, depth < 4)
+
+
 def test_eq17_nothing_in_the_mask_is_an_error() -> None:
     with pytest.raises(ReconError, match="mask"):
         depth_cluster(torch.ones(5, 5), torch.zeros(5, 5, dtype=torch.bool))
@@ -190,6 +201,20 @@ def test_sample_depth_is_exact_on_a_plane_and_nan_at_edges(generator: torch.Gene
     # two pixels from the edge the other surface must not leak into the fit
     z, _ = sample_depth(cut, torch.tensor([[23.4, 20.0]]))
     torch.testing.assert_close(z, torch.tensor([2 + 0.234 - 0.1]), atol=1e-6, rtol=0)
+
+
+def test_where_two_surfaces_meet_the_depth_around_is_given_with_a_variance_that_spans_them() -> None:
+    depth = torch.full((60, 60), torch.nan)
+    depth[10:50, 10:30], depth[10:50, 30:50] = 3.0, 3.4
+    xy = torch.tensor([[20.0, 30.0], [29.6, 30.0], [8.0, 30.0], [2.0, 2.0]])  # on one, between two, off the edge, away
+    plain, _ = sample_depth(depth, xy)
+    assert torch.isfinite(plain).tolist() == [True, False, False, False]
+    value, variance = sample_depth(depth, xy, SampleParams(around=2.5))
+    assert torch.isfinite(value).tolist() == torch.isfinite(variance).tolist() == [True, True, True, False]
+    assert value[0] == plain[0]
+    assert abs(float(value[1]) - 3.2) < 0.04
+    assert 0.15 < float(variance[1] ** 0.5) < 0.25
+    assert abs(float(value[2]) - 3.0) < 1e-4
 
 
 def test_sample_depth_variance_is_the_pixel_noise(generator: torch.Generator) -> None:

@@ -259,3 +259,27 @@ def test_unknown_solver_and_rank_are_named():
     for name in sorted(COMPLETE_ONLY):
         with pytest.raises(ReconError, match="every point in every frame"):
             get_solver(name)(Tracks(tracks.xy, _gaps(40, 20)), 1)
+
+
+def test_out_of_the_sensors_range_the_size_in_the_image_tells_the_distance():
+    g = torch.Generator().manual_seed(0)
+    shape = torch.randn(60, 3, generator=g) * torch.tensor([0.25, 0.5, 0.2])
+    wave = 0.05 * torch.sin(torch.arange(40)[:, None] / 4 + torch.arange(60))
+    distance = torch.linspace(5, 15, 40)
+    truth = shape + wave[..., None] * torch.tensor([0.3, 1.0, 0.5])
+    placed = truth + distance[:, None, None] * torch.tensor([0.0, 0.0, 1.0])
+    k = torch.tensor([[600.0, 0.0, 384.0], [0.0, 600.0, 288.0], [0.0, 0.0, 1.0]])
+    xy = (placed @ k.mT)[..., :2] / placed[..., 2:] + 0.1 * torch.randn(40, 60, 2, generator=g)
+    depth = torch.where(placed[..., 2] < 9, placed[..., 2] + 0.01 * torch.randn(40, 60, generator=g), torch.nan)
+    tracks = Tracks(
+        xy,
+        covariance=(0.01 * torch.eye(2)).expand(40, 60, 2, 2),
+        intrinsics=k,
+        depth=depth,
+        depth_variance=torch.where(torch.isfinite(depth), 1e-4, torch.nan),
+        fps=25.0,
+    )
+    rec = get_solver("auto")(tracks, 2)
+    assert "steady turn of 0 degrees" in rec.status.text
+    torch.testing.assert_close(rec.translation[:, 2], distance, rtol=0.1, atol=0)
+    assert float((rec.points3d - (truth - truth.mean(1, keepdim=True))).norm(dim=-1).mean()) < 0.05

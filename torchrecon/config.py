@@ -84,7 +84,7 @@ class DepthParams:
 
     bilateral: BilateralParams = field(default_factory=BilateralParams)
     box: BoxParams = field(default_factory=BoxParams)
-    sample: SampleParams = field(default_factory=SampleParams)
+    sample: SampleParams = field(default_factory=lambda: SampleParams(around=2.5))
 
 
 @dataclass(frozen=True)

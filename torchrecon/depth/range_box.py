@@ -25,12 +25,15 @@ class BoxParams:
         centre_width: standard deviation of the window in which a cluster has to lie, fraction of the image's smaller
             side; not used where a mask is given.
         margin: what the box is larger than the cluster on each side, metres.
+        reach: how far before or behind the cluster other pixels of a mask still are the body: arms before the trunk
+            and legs below a shirt are surfaces of their own, metres.
     """
 
     step: float = 0.02
     step_floor: float = 0.03
     centre_width: float = 0.06
     margin: float = 0.02
+    reach: float = 0.7
 
 
 def range_box(
@@ -114,7 +117,8 @@ def auto_box(
 
     Args:
         points: organised cloud of :func:`torchrecon.depth.backproject`, metres; NaN where there is no depth.
-        mask: pixels that may belong to the body; see :func:`depth_cluster`.
+        mask: pixels that may belong to the body; see :func:`depth_cluster`. All of them that lie within reach of the
+            cluster are in the box: what a mask has too much of, and far behind, is not.
 
     Returns:
         (centre, half), metres, camera axes.
@@ -130,6 +134,9 @@ def auto_box(
     """
     params = params or BoxParams()
     inside = depth_cluster(points[2], mask, params)
+    if mask is not None:
+        near, far = points[2, inside].amin() - params.reach, points[2, inside].amax() + params.reach
+        inside = mask & (points[2] > near) & (points[2] < far)
     body = points[:, inside]
     low, high = body.amin(-1), body.amax(-1)
     return (low + high) / 2, (high - low) / 2 + params.margin

@@ -53,9 +53,10 @@ def with_depth(
     tracks: Tracks,
     depths: Iterable[Float[Tensor, "height width"]],
     intrinsics: Float[Tensor, "3 3"],
-    params: SampleParams | None = None,
+    params: SampleParams = DepthParams().sample,
 ) -> Tracks:
-    """Tracks with the depth, and its variance, under every observation; NaN where the surface is not clear.
+    """Tracks with the depth, and its variance, under every observation; where the surface is not clear, by default,
+    that of the body around it, and NaN where there is none.
 
     Raises:
         ReconError: no observation has a depth.

@@ -181,7 +181,7 @@ def _fixed_position(motion: Motion, distance: float, generator: torch.Generator 
     travel = root[-1] - root[0]
     angle = uniform(generator, 0.0, 2 * torch.pi)
     if float(travel[[0, 2]].norm()) > 2.0:
-        angle = float(torch.atan2(travel[0], travel[2])) + uniform(generator, -0.5, 0.5)
+        angle = float(torch.atan2(travel[0], travel[2])) + uniform(generator, -0.2, 0.2)
     position = centre + distance * _around(angle)
     position[1] = uniform(generator, 1.0, 2.2)
     return position
