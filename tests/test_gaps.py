@@ -215,3 +215,23 @@ def test_gap_bookkeeping_and_errors() -> None:
         fill_gaps(Tracks(xy, visible), "magic")
     one = fill_gaps(Tracks(torch.rand(1, 3, 2)))
     assert one.xy.shape == (1, 3, 2)
+
+
+def test_a_gap_in_which_nothing_went_on_as_before_is_doubtful_as_a_whole_and_an_easy_one_is_not() -> None:
+    swing = 60 * torch.exp(-(((torch.arange(80.0) - 37) / 3) ** 2))
+    doubted, easy = 0, 0
+    for seed in range(6):
+        truth, xy = _joints(seed=seed)
+        visible = _hide(80, 14, 60, 2)
+        easy += int(fill_gaps(Tracks(xy, visible), "auto").low_confidence.any())
+        truth[:, 0, 0] += swing  # out and back while the point is hidden
+        xy[:, 0, 0] += swing
+        visible = _hide(80, 14, 30, 14)
+        filled = fill_gaps(Tracks(xy, visible), "auto")
+        assert float((filled.xy - truth)[30:44, 0].norm(dim=-1).max()) > 10
+        assert not filled.low_confidence[visible].any()
+        flags = filled.low_confidence[30:44, 0]
+        assert flags.all() or not flags.any()
+        doubted += int(flags.any())
+    assert doubted >= 5
+    assert easy <= 1

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from eval.reliability.world import low_rank_tracks
 from torchrecon.errors import ReconError
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Reconstruction, Tracks
@@ -259,6 +260,14 @@ def test_unknown_solver_and_rank_are_named():
     for name in sorted(COMPLETE_ONLY):
         with pytest.raises(ReconError, match="every point in every frame"):
             get_solver(name)(Tracks(tracks.xy, _gaps(40, 20)), 1)
+
+
+def test_only_a_body_that_may_be_rigid_has_to_prove_that_it_bends():
+    made = low_rank_tracks(60, 40, 3, 10.0, 20_000_000)
+    errors = [error3d_camera(get_solver("marginal")(Tracks(made.xy), k).points3d, made.points3d) for k in (1, 2)]
+    assert errors[1] < 0.2 < 0.4 < errors[0]
+    made = low_rank_tracks(60, 40, 1, 10.0, 20_000_001)
+    assert ", 0 modes" in get_solver("marginal")(Tracks(made.xy), 1).status.text
 
 
 def test_out_of_the_sensors_range_the_size_in_the_image_tells_the_distance():
