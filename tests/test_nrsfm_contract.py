@@ -292,3 +292,22 @@ def test_out_of_the_sensors_range_the_size_in_the_image_tells_the_distance():
     assert "steady turn of 0 degrees" in rec.status.text
     torch.testing.assert_close(rec.translation[:, 2], distance, rtol=0.1, atol=0)
     assert float((rec.points3d - (truth - truth.mean(1, keepdim=True))).norm(dim=-1).mean()) < 0.05
+
+
+def test_a_fixed_view_that_shifts_says_nothing_of_depth():
+    g = torch.Generator().manual_seed(3)
+    shape = torch.randn(50, 3, generator=g) * torch.tensor([0.25, 0.5, 0.2])
+    bend = torch.randn(50, 3, generator=g) * 0.05
+    truth = shape + torch.sin(torch.arange(40) / 5)[:, None, None] * bend
+    yaw = rotation_from_vector(torch.deg2rad(torch.linspace(-6, 6, 40))[:, None] * torch.tensor([0.0, 1.0, 0.0]))
+    truth = truth @ yaw.mT
+    side = torch.stack([torch.linspace(-1.0, 1.0, 40), torch.zeros(40), torch.full((40,), 7.0)], -1)
+    placed = truth + side[:, None]
+    k = torch.tensor([[600.0, 0.0, 384.0], [0.0, 600.0, 288.0], [0.0, 0.0, 1.0]])
+    visible = (torch.arange(40)[:, None] - torch.arange(50) * 40 / 50).abs() < 12
+    xy = (placed @ k.mT)[..., :2] / placed[..., 2:] + 0.3 * torch.randn(40, 50, 2, generator=g)
+    rec = get_solver("auto")(Tracks(xy, visible, intrinsics=k, fps=25.0), 2)
+    assert rec.status.code == "undetermined"
+    flat = torch.cat([truth[..., :2], torch.zeros(40, 50, 1)], -1)
+    bar = error3d_camera(flat, truth, visible, align_scale="sequence")
+    assert error3d_camera(rec.points3d, truth, visible, align_scale="sequence") < 1.1 * bar

@@ -354,6 +354,16 @@ def _at_distance(data: Observations, depth: Tensor, path: CameraPath, canonical:
     return CameraPath(path.rotations, path.translation * factor[:, None], path.log_scale - torch.log(factor))
 
 
+def _parallel(packed: Packed, path: CameraPath) -> tuple[Packed, CameraPath]:
+    """The same pinhole path with the rays of a frame parallel, so that a fixed view says nothing of depth.
+
+    Rays that converge seem to say a lot where the view shifts: a body that turns a little is a body of great depth.
+    """
+    distance = torch.exp(-path.log_scale) / packed.unit
+    shift = (path.translation - packed.offset * distance[:, None]) * torch.exp(path.log_scale)[:, None]
+    return replace(packed, perspective=False), CameraPath(path.rotations, shift, path.log_scale)
+
+
 def solve_trajectories(
     item: Tracks, rank: int, generator: torch.Generator, params: TrajectoryParams | None = None
 ) -> Reconstruction:
@@ -364,8 +374,10 @@ def solve_trajectories(
     params = params or TrajectoryParams()
     data = observe(item)
     found = find_path(observe(item.detach()), params)
-    packed = pack(data)
-    canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
+    packed, path = pack(data), found.path
+    if packed.perspective and item.depth is None and not found.speed.any():
+        packed, path = _parallel(packed, path)
+    canonical, spread, _ = posterior_points(packed, path, found.prior, found.noise)
     if item.depth is not None and item.intrinsics is not None:
         found = replace(found, path=_at_distance(data, item.depth, found.path, canonical))
         canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
