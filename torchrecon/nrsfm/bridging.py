@@ -47,7 +47,7 @@ def bridging(solve_one: SolveOne) -> SolveOne:
         if not MIN_FRAMES <= int(seen.sum()) < len(seen):
             return solve_one(item, rank, generator)
         index = seen.nonzero()[:, 0]
-        return _bridged(solve_one(item.select(frames=index), rank, generator), item, index)
+        return _bridged(solve_one(item.select(frames=index.cpu()), rank, generator), item, index)
 
     return solve
 
