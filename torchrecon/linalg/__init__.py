@@ -1,5 +1,6 @@
 """Small linear algebra on tensors: rotations and alignment, low-rank fits with missing entries."""
 
+from torchrecon.linalg.interpolation import interpolated
 from torchrecon.linalg.rotations import (
     nearest_orthogonal,
     nearest_rotation,
@@ -10,6 +11,7 @@ from torchrecon.linalg.rotations import (
 )
 
 __all__ = [
+    "interpolated",
     "nearest_orthogonal",
     "nearest_rotation",
     "rotation_angle",

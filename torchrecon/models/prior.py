@@ -19,7 +19,7 @@ from torch import nn
 
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.errors import ReconError
-from torchrecon.linalg import rotation_from_vector
+from torchrecon.linalg import interpolated, rotation_from_vector
 from torchrecon.measurement import ShapeBelief, Tracks
 from torchrecon.measurement.camera import normalised_coordinates
 from torchrecon.models.joints import JOINTS, PARENTS, match_joints
@@ -168,14 +168,9 @@ def _between(times: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
 
 def _bridged(centre: Float[Tensor, "frames 1 2"], seen: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 1 2"]:
     """Centres with those of frames that show nothing on a straight line between their neighbours."""
-    known = seen.nonzero()[:, 0]
-    if not len(known):
+    if not bool(seen.any()):
         raise ReconError("tracks: no joint that the prior knows is seen in two frames in a row; nothing can be said")
-    frame = torch.arange(len(seen), device=seen.device)
-    before, share = _between(known.to(centre.dtype), frame.to(centre.dtype))
-    after = (before + 1).clamp_max(len(known) - 1)
-    start, end = centre[known[before]], centre[known[after]]
-    return start + share[:, None, None] * (end - start)
+    return interpolated(centre, seen)
 
 
 def _towards(xy: Float[Tensor, "frames joints 2"], seen: Bool[Tensor, "frames joints"]) -> Float[Tensor, "frames 3 3"]:

@@ -12,7 +12,7 @@ from functools import wraps
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
-from torchrecon.linalg import nearest_rotation
+from torchrecon.linalg import interpolated, nearest_rotation
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import MIN_FRAMES, mirror_sign
 
@@ -54,25 +54,20 @@ def bridging(solve_one: SolveOne) -> SolveOne:
 
 def _bridged(part: Reconstruction, item: Tracks, index: Int[Tensor, " seen"]) -> Reconstruction:
     """The answer for all frames from that for the frames ``index``."""
-    frame = torch.arange(item.frames, device=index.device)
-    after = torch.searchsorted(index, frame).clamp_max(len(index) - 1)
-    before = (torch.searchsorted(index, frame, right=True) - 1).clamp_min(0)
-    there = (frame == index[before]) | (frame == index[after])
-    first, last = item.times[index[before]], item.times[index[after]]
-    share = ((item.times - first) / torch.where(last > first, last - first, torch.ones_like(first))).clamp(0, 1)
-    share = share.to(part.points3d.dtype)
+    seen = item.visible.any(-1)
 
     def blend(values: Tensor) -> Tensor:
-        part_after = share.view(-1, *[1] * (values.ndim - 1))
-        return (1 - part_after) * values[before] + part_after * values[after]
+        whole = values.new_zeros(item.frames, *values.shape[1:]).index_copy(0, index, values)
+        return interpolated(whole, seen)
 
-    turned = nearest_rotation(blend(part.rotations))
-    rotations = torch.where(there[:, None, None], part.rotations[before], turned)
-    moved = blend(part.canonical) @ rotations.mT
-    points3d = torch.where(there[:, None, None], part.points3d[before], moved)
+    rotations = torch.where(seen[:, None, None], blend(part.rotations), nearest_rotation(blend(part.rotations)))
+    points3d = torch.where(seen[:, None, None], blend(part.points3d), blend(part.canonical) @ rotations.mT)
     covariance = None
     if part.covariance3d is not None:
-        away = torch.minimum((frame - index[before]).abs(), (index[after] - frame).abs())
+        frame = torch.arange(item.frames, device=index.device)
+        before = torch.where(seen, frame, -item.frames).cummax(0).values
+        after = torch.where(seen, frame, 2 * item.frames).flip(0).cummin(0).values.flip(0)
+        away = torch.minimum(frame - before, after - frame)
         eye = torch.eye(3, dtype=points3d.dtype, device=points3d.device)
         covariance = blend(part.covariance3d) + _wandered(part.points3d, away)[:, None, None, None] * eye
     status = part.statuses[0]

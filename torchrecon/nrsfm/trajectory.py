@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
+from torchrecon.linalg import interpolated
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import check_size, mirror_sign, solve_items, turn_of_view
 from torchrecon.nrsfm.likelihood import (
@@ -107,26 +108,8 @@ class FoundPath:
 
 def _centres(data: Observations) -> Tensor:
     """Mean image position of the seen points (F, 2), interpolated over frames that see nothing."""
-    count = data.visible.sum(1)[:, None]
-    return interpolated(torch.where(count > 0, data.xy.sum(1) / count.clamp_min(1), torch.nan))
-
-
-def interpolated(values: Float[Tensor, "frames ..."]) -> Float[Tensor, "frames ..."]:
-    """Frames that are NaN take what lies evenly between their neighbours, or the nearest at either end.
-
-    Example:
-        >>> import torch
-        >>> interpolated(torch.tensor([torch.nan, 1.0, torch.nan, 3.0])).tolist()
-        [1.0, 1.0, 2.0, 3.0]
-    """
-    there = torch.isfinite(values.flatten(1)).all(1) if values.ndim > 1 else torch.isfinite(values)
-    known = there.nonzero()[:, 0]
-    frame = torch.arange(len(values), device=values.device)
-    after = known[torch.searchsorted(known, frame).clamp(max=len(known) - 1)]
-    before = known[(torch.searchsorted(known, frame, right=True) - 1).clamp_min(0)]
-    share = ((frame - before) / (after - before).clamp_min(1)).clamp(0, 1).to(values.dtype)
-    share = share.view(-1, *[1] * (values.ndim - 1))
-    return (1 - share) * values[before] + share * values[after]
+    count = data.visible.sum(1)
+    return interpolated(data.xy.sum(1) / count.clamp_min(1)[:, None], count > 0)
 
 
 def _prior(data: Observations, axis: Tensor, params: TrajectoryParams) -> MotionPrior:
@@ -182,7 +165,7 @@ def _starts(
     if perspective and bool(torch.isfinite(measured).any()):
         # Out of the sensor's range the size of the body in the image says how far away it is.
         size = -torch.log(rigid.translation[:, 2].clamp_min(1e-6))
-        log_scale = size + interpolated(measured - size)
+        log_scale = size + interpolated(measured - size, torch.isfinite(measured))
         away = torch.exp(-log_scale) / data.unit
     still = path(rigid)
     found = rigid_turns(plane, visible, data.tracks.fps, params.axes, not perspective, params.turn)
