@@ -21,15 +21,19 @@ def bending(frames: int, points: int, seed: int = 0) -> torch.Tensor:
     return (shape - shape.mean(1, keepdim=True)) @ turn.mT
 
 
-def test_gradient_of_the_default_solver_is_that_of_whole_solves():
+@pytest.mark.parametrize("empty", [[], [0, 5]])
+def test_gradient_of_the_default_solver_is_that_of_whole_solves(empty):
     g = torch.Generator().manual_seed(1)
-    truth = bending(8, 7)
-    xy = (truth[..., :2] + torch.randn(8, 7, 2, generator=g, dtype=torch.float64)).requires_grad_()
-    noise = torch.eye(2, dtype=torch.float64).repeat(8, 7, 1, 1).requires_grad_()
+    frames = 8 + len(empty)
+    truth = bending(frames, 7)
+    xy = (truth[..., :2] + torch.randn(frames, 7, 2, generator=g, dtype=torch.float64)).requires_grad_()
+    noise = torch.eye(2, dtype=torch.float64).repeat(frames, 7, 1, 1).requires_grad_()
+    visible = torch.ones(frames, 7, dtype=torch.bool)
+    visible[empty] = False
     weight = torch.randn(truth.shape, generator=g, dtype=torch.float64)
 
     def score(xy: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        return (tr.reconstruct(tr.Tracks(xy, covariance=noise), 2).points3d * weight).sum()
+        return (tr.reconstruct(tr.Tracks(xy, visible, covariance=noise), 2).points3d * weight).sum()
 
     by_xy, by_noise = torch.autograd.grad(score(xy, noise), (xy, noise))
     step = torch.randn(xy.shape, generator=g, dtype=torch.float64)

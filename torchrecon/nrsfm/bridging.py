@@ -12,7 +12,7 @@ from functools import wraps
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
-from torchrecon.linalg import interpolated, nearest_rotation
+from torchrecon.linalg import interpolated
 from torchrecon.measurement import Reconstruction, Status, Tracks
 from torchrecon.nrsfm.base import MIN_FRAMES, mirror_sign
 
@@ -60,7 +60,12 @@ def _bridged(part: Reconstruction, item: Tracks, index: Int[Tensor, " seen"]) ->
         whole = values.new_zeros(item.frames, *values.shape[1:]).index_copy(0, index, values)
         return interpolated(whole, seen)
 
-    rotations = torch.where(seen[:, None, None], blend(part.rotations), nearest_rotation(blend(part.rotations)))
+    # Gram-Schmidt: a polar factor has no gradient at a rotation, and most of these are ones.
+    x, y, _ = blend(part.rotations).unbind(-2)
+    x = torch.nn.functional.normalize(x, dim=-1)
+    y = torch.nn.functional.normalize(y - (y * x).sum(-1, keepdim=True) * x, dim=-1)
+    turned = torch.stack([x, y, torch.linalg.cross(x, y)], -2)
+    rotations = torch.where(seen[:, None, None], blend(part.rotations), turned)
     points3d = torch.where(seen[:, None, None], blend(part.points3d), blend(part.canonical) @ rotations.mT)
     covariance = None
     if part.covariance3d is not None:
