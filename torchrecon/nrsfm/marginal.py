@@ -155,7 +155,7 @@ def solve_marginal(
     if params.spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
         smooth = partial(smoothed, params=params.smoothing)
         errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)
-        covariance = widened(covariance, errors, params.spread.window)
+        covariance = params.spread.calibration**2 * widened(covariance, errors, params.spread.window)
     complaint = None if converged else "the likelihood still rose when the rounds of growth and descent were over"
     # What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in
     # pixels of the tracks in every frame.

@@ -32,11 +32,15 @@ class SpreadParams:
         draws: of the noise; none leaves the closed form as it is (count).
         steps: quasi-Newton steps of a refit (count).
         window: half-width of the average over frames of a frame's factor (frames).
+        calibration: factor on the standard deviations, because refits start at the answer and stay in its basin. With
+            it 95 % ellipsoids hold 95 % of 24 synthetic low-rank bodies at 10 and 20 dB (without: 93.0 %), of other
+            sizes and seeds than those of ``eval.reliability``.
     """
 
     draws: int = 4
     steps: int = 15
     window: int = 4
+    calibration: float = 1.08
 
 
 def posterior_covariance(
