@@ -16,6 +16,7 @@ import torchrecon as tr
 from tests.kill import check_whole, die_on_two, kill_after, results
 from torchrecon.cli import main
 from torchrecon.errors import ReconError
+from torchrecon.io.frames import find_recording
 from torchrecon.pipeline import batch as module
 from torchrecon.pipeline.batch import BatchSettings, find_items, run_batch, run_item
 from torchrecon.pipeline.workers import Died, work_through
@@ -123,16 +124,18 @@ def test_a_folder_with_frames_brings_its_masks_depth_and_camera(tmp_path, monkey
     (tmp_path / "in" / "all" / "cameras.json").touch()
     given: dict[str, list[object]] = {}
 
-    def record(video, out, *, masks, depth, camera, **rest):
-        given[out.name] = [None if p is None else str(p.relative_to(tmp_path)) for p in (video, masks, depth, camera)]
+    def record(video, out, *, camera, **rest):
+        beside = find_recording(video)
+        paths = (video, beside.masks, beside.depth, camera)
+        given[out.name] = [None if p is None else str(p.relative_to(tmp_path)) for p in paths]
         raise ReconError("seen")
 
     monkeypatch.setattr(module, "reconstruct_video", record)
     settings = BatchSettings(camera=tmp_path / "common.json")
     assert set(states(run_batch(tmp_path / "in", tmp_path / "out", settings, workers=0)).values()) == {"failed"}
     assert given == {
-        "all": ["in/all/frames", "in/all/masks", "in/all/depth", "in/all/cameras.json"],
-        "bare": ["in/bare/frames", None, None, "common.json"],
+        "all": ["in/all", "in/all/masks", "in/all/depth", "in/all/cameras.json"],
+        "bare": ["in/bare", None, None, "common.json"],
         "images": ["in/images", None, None, "common.json"],
     }
 

@@ -81,9 +81,8 @@ def test_measured_depth_gives_metres(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # as after a plain install, which ends with the page too
     clip = film(tmp_path, depth=True)
     out = tmp_path / "out"
-    command = ["reconstruct", str(tmp_path / "frames"), "-o", str(out), "--masks", str(tmp_path / "masks")]
-    command += ["--camera", str(tmp_path / "camera.json"), "--depth", str(tmp_path / "depth")]
-    assert main(command) == 0
+    # The folder holds frames/, masks/, depth/ and camera.json, and brings them all.
+    assert main(["reconstruct", str(tmp_path), "-o", str(out)]) == 0
     assert {path.name for path in out.glob("*.[ph]*")} == {"report.html"}
     tracks = tr.load_tracks(out / "tracks.npz")
     rec = tr.Reconstruction.load(out / "reconstruction.npz")

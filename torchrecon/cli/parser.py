@@ -134,7 +134,11 @@ def _tracks(command: argparse.ArgumentParser) -> None:
 
 
 def _video(command: argparse.ArgumentParser) -> None:
-    command.add_argument("video", metavar="VIDEO", help="video file or folder of numbered images")
+    command.add_argument(
+        "video",
+        metavar="VIDEO",
+        help="video file or folder of numbered images (frames/ in it brings masks/, depth/ and camera.json)",
+    )
     command.add_argument("--masks", metavar="DIR", help="one image per frame, non-zero = person")
     command.add_argument("--depth", metavar="DIR", help="one 16-bit image per frame, millimetres, 0 = none")
     command.add_argument("--camera", metavar="FILE", help='JSON: {"K": 3x3} or {"cameras": [{"intrinsic": 3x3}]}')

@@ -26,8 +26,10 @@ __all__ = [
     "CameraFile",
     "FrameSource",
     "ImageFolder",
+    "Recording",
     "Stills",
     "encode_stills",
+    "find_recording",
     "load_camera",
     "open_depths",
     "open_frames",
@@ -211,7 +213,8 @@ def open_frames(path: str | os.PathLike[str], fps: float | None = None) -> Frame
     """Open a video file, or a folder of numbered images, as a source of RGB frames.
 
     Args:
-        path: a video file that OpenCV can decode, or a folder (8 or 16 bit, grey or colour, alpha ignored).
+        path: a video file that OpenCV can decode, or a folder (8 or 16 bit, grey or colour, alpha ignored), or one
+            that holds such a folder as ``frames/``.
         fps: frames per second; default: what the file states, and 25 for a folder.
 
     Returns:
@@ -231,12 +234,36 @@ def open_frames(path: str | os.PathLike[str], fps: float | None = None) -> Frame
     """
     source = Path(path)
     if source.is_dir():
-        return ImageFolder(source, _to_rgb, fps)
+        return ImageFolder(source / "frames" if (source / "frames").is_dir() else source, _to_rgb, fps)
     if not source.is_file():
         raise ReconError(f"{source}: no such file or folder")
     if source.stat().st_size == 0:
         raise ReconError(f"{source}: is empty")
     return _VideoFile(source, fps)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What lies beside the frames of a clip; None where there is none."""
+
+    masks: Path | None
+    depth: Path | None
+    camera: Path | None
+
+
+def find_recording(path: str | os.PathLike[str]) -> Recording:
+    """The ``masks/``, ``depth/`` and ``camera.json`` (or ``cameras.json``) of a folder that holds ``frames/``.
+
+    Example:
+        >>> find_recording("clip.mp4")
+        Recording(masks=None, depth=None, camera=None)
+    """
+    folder = Path(path)
+    if not (folder / "frames").is_dir():
+        return Recording(None, None, None)
+    masks, depth = (folder / name if (folder / name).is_dir() else None for name in ("masks", "depth"))
+    cameras = [folder / name for name in ("camera.json", "cameras.json") if (folder / name).is_file()]
+    return Recording(masks, depth, cameras[0] if cameras else None)
 
 
 def open_masks(folder: str | os.PathLike[str]) -> ImageFolder[Bool[Tensor, "height width"]]:

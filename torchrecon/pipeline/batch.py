@@ -18,7 +18,7 @@ import torchrecon
 from torchrecon.config import Config, to_mapping
 from torchrecon.errors import ReconError
 from torchrecon.io.files import plain, remove_leftovers, write_bytes, write_json
-from torchrecon.io.frames import load_camera
+from torchrecon.io.frames import find_recording, load_camera
 from torchrecon.io.tracks import load_tracks
 from torchrecon.measurement import Reconstruction
 from torchrecon.pipeline.reconstructor import reconstruct
@@ -230,16 +230,11 @@ def run_item(item: BatchItem, out: Path, settings: BatchSettings) -> dict[str, A
 
 
 def _reconstruct_video(item: BatchItem, folder: Path, settings: BatchSettings) -> Reconstruction:
-    source = item.source
-    kit = (source / "frames").is_dir()
-    own = [source / name for name in ("camera.json", "cameras.json") if kit and (source / name).is_file()]
     # The folder is this item's, whatever settings an earlier batch had: force.
     return reconstruct_video(
-        source / "frames" if kit else source,
+        item.source,
         folder,
-        masks=source / "masks" if kit and (source / "masks").is_dir() else None,
-        depth=source / "depth" if kit and (source / "depth").is_dir() else None,
-        camera=own[0] if own else settings.camera,
+        camera=find_recording(item.source).camera or settings.camera,
         config=settings.config,
         rank=settings.rank,
         solver=settings.solver,

@@ -20,7 +20,7 @@ from torchrecon.contour import background_paths, find_mover, own_motion
 from torchrecon.errors import ReconError
 from torchrecon.features import track_points
 from torchrecon.io.files import remove_leftovers, write_json
-from torchrecon.io.frames import FrameSource, load_camera, open_depths, open_frames, open_masks
+from torchrecon.io.frames import FrameSource, find_recording, load_camera, open_depths, open_frames, open_masks
 from torchrecon.measurement import RankEstimate, Reconstruction, Solver, Tracks
 from torchrecon.pipeline.depth import body_depth, with_depth
 from torchrecon.pipeline.reconstructor import reconstruct
@@ -46,7 +46,8 @@ def track_video(
     """Track points of the moving body in a clip.
 
     Args:
-        video: video file or folder of numbered images.
+        video: video file or folder of numbered images; a folder that holds these as ``frames/`` brings its ``masks/``,
+            ``depth/`` and ``camera.json`` (or ``cameras.json``), unless they are given.
         masks: folder with one image per frame, non-zero = person; None: the mover is found in the clip itself.
         depth: folder with one 16-bit image per frame in millimetres, registered to the frames; needs ``camera``.
         camera: JSON file with the intrinsics.
@@ -59,6 +60,8 @@ def track_video(
     Raises:
         ReconError: unreadable input, counts or sizes that do not fit, or too few tracks.
     """
+    beside = find_recording(video)
+    masks, depth, camera = masks or beside.masks, depth or beside.depth, camera or beside.camera
     frames = open_frames(video)
     if depth is not None and camera is None:
         raise ReconError("--depth: needs --camera FILE with the intrinsics of the sensor")
@@ -109,7 +112,8 @@ def reconstruct_video(
     Raises:
         ReconError: as :func:`track_video`; a folder that holds another run's results, without ``force``.
     """
-    folder = Path(out)
+    folder, beside = Path(out), find_recording(video)
+    masks, depth, camera = masks or beside.masks, depth or beside.depth, camera or beside.camera
     run: dict[str, object] = {
         "video": str(Path(video).resolve()),
         "masks": None if masks is None else str(Path(masks).resolve()),
