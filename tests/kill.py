@@ -128,9 +128,10 @@ def _kill_at_random_moments(
     """``longest``: seconds after a result appeared, or after the start, in which the kill comes."""
     work = work / name
     work.mkdir(parents=True)
-    calm, out = work / "calm", work / "out"
-    assert _start(command(calm)).wait() == 0
-    wanted = results(calm)
+    out = work / "out"  # the undisturbed run too: a page names the command that made it, and so its folder
+    assert _start(command(out)).wait() == 0
+    wanted = results(out)
+    shutil.rmtree(out)
     draw = random.Random(seed)
     hits = 0
     for number in range(moments):
@@ -149,7 +150,8 @@ def _kill_at_random_moments(
         assert _start(command(out)).wait() == 0
         found = results(out)
         assert found.keys() == wanted.keys(), set(found) ^ set(wanted)  # temporary files are gone too
-        assert [key for key in wanted if found[key] != wanted[key]] == []
+        differ = [key for key in wanted if found[key] != wanted[key]]
+        assert differ == [], f"{name} {number + 1}/{moments}: another content than undisturbed: {', '.join(differ)}"
         end = "killed" if killed else "had ended"
         print(f"{name} {number + 1}/{moments}: {end}, {held} of {len(wanted)} files were there", flush=True)
         shutil.rmtree(out)
