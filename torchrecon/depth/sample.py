@@ -66,8 +66,9 @@ def sample_depth(
     nan = depth.new_tensor(float("nan"))
     depth = torch.where(depth > 0, depth, nan)
     window, u, v = _window(depth, xy, params.radius)
-    centre = window[..., window.shape[-1] // 2, None]
-    ring = _ring(params.radius, depth.device)
+    middle = [window.shape[-1] // 2]
+    centre = window[..., middle]
+    ring = torch.maximum((u - u[..., middle]).abs(), (v - v[..., middle]).abs())
     limit = torch.clamp(params.jump_relative * centre, min=params.jump)
     difference = (window - centre).abs()
     broken = ((difference > limit) & (ring <= 1)).any(-1)
@@ -93,12 +94,6 @@ def sample_depth(
         near, spread = _around(depth, xy, params)
         value, variance = torch.where(good, value, near), torch.where(good, variance, spread)
     return value, variance
-
-
-def _ring(radius: int, device: torch.device) -> Int[Tensor, " window"]:
-    """Distance from the middle of a square window, in rings of pixels."""
-    reach = torch.arange(-radius, radius + 1, device=device).abs()
-    return torch.maximum(reach[:, None], reach).flatten()
 
 
 def _window(
