@@ -54,10 +54,26 @@ def test_a_window_that_says_too_little_is_named(generator):
     truth = turning(120, 12, generator)
     still = truth[:1].expand(60, -1, -1)
     answer = solve_windows(
-        tr.Tracks(torch.cat([truth, still])[..., :2]), 1, generator, solve_rigid, WindowParams(0, 50, 10)
+        tr.Tracks(torch.cat([truth, still])[..., :2]), 1, generator, solve_rigid, WindowParams(0, 50, 10, turn=0.0)
     )
     assert answer.status.code == "undetermined"
     assert answer.status.text.startswith("window 5 of 5, frames 130 to 179: the view turns")
+
+
+def test_windows_grow_where_the_view_stands_still(generator):
+    truth = turning(120, 12, generator)
+    seen = torch.cat([truth, truth[-1:].expand(60, -1, -1)])
+    answer = solve_windows(tr.Tracks(seen[..., :2]), 1, generator, solve_rigid, WindowParams(0, 50, 10))
+    assert answer.status.ok
+    assert answer.status.text == "2 windows of 100 frames"
+    assert float(error3d_camera(answer.points3d, seen)) < 1e-6
+
+
+def test_a_long_sequence_of_one_view_is_solved_in_one_piece(generator):
+    still = turning(120, 12, generator)[:1].expand(90, -1, -1)
+    answer = solve_windows(tr.Tracks(still[..., :2].clone()), 1, generator, solve_rigid, WindowParams(0, 50, 10))
+    assert answer.status.code == "undetermined"
+    assert not answer.status.text.startswith("window")
 
 
 def told(truth: torch.Tensor) -> Callable[[tr.Tracks, int, torch.Generator], tr.Reconstruction]:

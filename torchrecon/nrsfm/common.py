@@ -73,6 +73,7 @@ def conclude(
     rank: int,
     complaint: str | None,
     summary: str,
+    doubt: str | None = None,
     covariance3d: Float[Tensor, "frames points 3 3"] | None = None,
 ) -> Reconstruction:
     """Apply the mirror rule and say what the data leave open.
@@ -80,6 +81,7 @@ def conclude(
     Args:
         points3d: camera axes.
         complaint: what had not converged; None where all had.
+        doubt: why the depth is not determined, where the method found that out by itself.
         summary: text of the status ``ok``; the turn of the view is added.
     """
     flip = torch.ones(3, dtype=points3d.dtype, device=points3d.device)
@@ -100,6 +102,8 @@ def conclude(
             f"{1 - linked:.0%} of the pairs of frames share fewer than {MIN_POINTS} points; the cameras of this method "
             "need tracks that last, use solver 'trajectory'",
         )
+    if status is None and doubt is not None:
+        status = Status("undetermined", doubt)
     if status is None and complaint is not None:
         status = Status("not_converged", complaint)
     if status is None:

@@ -10,6 +10,7 @@ The model is in ``shape_likelihood``; the search is derived here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -18,13 +19,14 @@ import torch
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg.noise_edge import difference_noise, marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
-from torchrecon.nrsfm.base import check_size, solve_items
+from torchrecon.nrsfm.base import check_size, solve_items, turn_of_view
 from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.relief import ReliefParams, deeper_answer
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
 from torchrecon.nrsfm.spread import SpreadParams, posterior_covariance, refitted, widened
@@ -42,6 +44,7 @@ class MarginalParams:
         descent: of the quasi-Newton descent.
         smoothing: of noisy tracks over time, before anything else.
         spread: of the refits that tell how far the points may be off.
+        relief: of the search for a deeper shape that explains the tracks as well.
         coarse, fine: first and last standard deviation of the residual.
         finest: how far below ``fine`` the residual goes on falling while no new mode appears.
         levels: number of residual levels, geometric from coarse to fine (count).
@@ -49,6 +52,7 @@ class MarginalParams:
         starts: starts from the metric upgrade, lowest residual first (count).
         gram_bases: numbers of bases for which the upgrade of least trace supplies one more start (count).
         steps: quasi-Newton steps of a round (count).
+        rigid_steps: quasi-Newton steps of the fits of a rigid body (count).
         growths: steps of expectation-maximisation before them (count).
         last_rounds: rounds of growth and descent on the fine level; the others have one (count).
         settled: fall of the value per frame over a round at which the fine level has converged (nats).
@@ -62,6 +66,7 @@ class MarginalParams:
     descent: DescentParams = field(default_factory=DescentParams)
     smoothing: SmoothingParams = field(default_factory=SmoothingParams)
     spread: SpreadParams = field(default_factory=SpreadParams)
+    relief: ReliefParams = field(default_factory=ReliefParams)
     coarse: float = 0.1
     fine: float = 0.003
     finest: float = 0.0001
@@ -70,6 +75,7 @@ class MarginalParams:
     starts: int = 1
     gram_bases: tuple[int, ...] = (2, 3)
     steps: int = 15
+    rigid_steps: int = 60
     growths: int = 2
     last_rounds: int = 8
     settled: float = 0.05
@@ -156,6 +162,17 @@ def solve_marginal(
         smooth = partial(smoothed, params=params.smoothing)
         errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)
         covariance = params.spread.calibration**2 * widened(covariance, errors, params.spread.window)
+    doubt = None
+    turn = float(turn_of_view(model.rotations[0].detach()))
+    if turn < params.relief.turn:
+        level = _told_noise(fixed, params)
+        other = deeper_answer(
+            fixed, model, answer, eps, params.modes, level, draws, params.steps, params.relief, params.descent
+        )
+        if other is not None:
+            away = (other - answer.points[0]).detach()
+            covariance = covariance + away[..., :, None] * away[..., None, :]
+            doubt = f"a deeper shape explains views that turn by {turn:.0f} degrees as well; they do not determine depth"
     complaint = None if converged else "the likelihood still rose when the rounds of growth and descent were over"
     # What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in
     # pixels of the tracks in every frame.
@@ -166,11 +183,18 @@ def solve_marginal(
         torch.ones_like(model.scale[0]),
         answer.translation[0],
         rank=rank,
+        doubt=doubt,
         complaint=complaint,
         summary=f"likeliest of {starts} starts, {model.loadings.shape[-1]} modes",
         covariance3d=covariance,
     )
     return answered.to(dtype=dtype)
+
+
+def _told_noise(views: Views, params: MarginalParams) -> float:
+    """Variance of the observations that a mode has to be told from; below the last residual it is a part of that."""
+    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+    return noise if noise > params.fine**2 else 0.0
 
 
 def _search(
@@ -189,10 +213,10 @@ def _search(
     found = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
     starts = [start[2] for start in found[: params.starts]]
     starts += [gram_upgrade(stack, 3 * bases, scaled=False).rotations for bases in params.gram_bases]
+    starts += [gram_upgrade(stack, 3, scaled=True).rotations]
     rotations = torch.stack(starts)
     model = _rigid_model(complete, rotations)
-    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
-    noise = noise if noise > params.fine**2 else 0.0  # below the last residual it is a part of that
+    noise = _told_noise(views, params)
     fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
     eps, level, before = params.coarse, 0, -1
     value = torch.full_like(model.scale[:, 0], torch.inf)
@@ -211,8 +235,17 @@ def _search(
         # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly.
         modes = model.loadings.shape[-1]
         if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
-            return model, eps, len(rotations), converged
+            break
         eps, level, before = eps * fall, level + 1, modes
+    # Modes that come in before the views are right can stand for a turn: a body that does not bend is tried as well.
+    stiff = _rigid_model(complete, rotations)
+    for residual in (params.coarse, eps):
+        stiff, stiff_value, ended = descend(views, stiff, residual, params.rigid_steps, params.descent)
+    # Every mode costs what its numbers can explain of pure noise (Schwarz 1978).
+    cost = 0.5 * model.loadings[0].numel() * math.log(2 * int(views.visible.sum()))
+    if float(stiff_value.min()) < float(value) + cost:
+        return stiff.pick(int(stiff_value.argmin())), eps, len(rotations), ended
+    return model, eps, len(rotations), converged
 
 
 def _shapeless(data: Observations) -> Status | None:

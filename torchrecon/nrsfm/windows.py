@@ -1,7 +1,9 @@
 """Long sequences in windows: cost and memory linear in the number of frames.
 
 Overlapping windows are solved one after the other. In the frames that two windows share, the later one takes the
-mirror image and the canonical axes of the earlier one, and the answers fade into each other.
+mirror image and the canonical axes of the earlier one, and the answers fade into each other. A window can only know
+the depth if the view turns within it: a solve of every n-th frame says by how much, and where that is too little the
+windows grow, in the end to the whole sequence.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import torch
 from torchrecon._typing import Tensor
 from torchrecon.linalg import nearest_rotation
 from torchrecon.measurement import Reconstruction, Status, Tracks
-from torchrecon.nrsfm.base import mirror_sign
+from torchrecon.nrsfm.base import mirror_sign, turn_of_view
 
 __all__ = ["WindowParams", "solve_windows", "window_starts"]
 
@@ -29,11 +31,13 @@ class WindowParams:
         longest: sequence that is solved in one piece (frames).
         length: of a window (frames).
         overlap: of neighbouring windows, at least (frames).
+        turn: by which the view has to change within a window (degrees).
     """
 
     longest: int = 1000
     length: int = 500
     overlap: int = 60
+    turn: float = 90.0
 
 
 def window_starts(frames: int, params: WindowParams) -> list[int]:
@@ -61,8 +65,10 @@ def solve_windows(
     The status is that of the first window that is not ``ok``; its text says which one.
     """
     params = params or WindowParams()
-    starts = window_starts(item.frames, params)
-    length = min(params.length, item.frames)
+    length = _telling_length(item, rank, generator, solve_one, params)
+    if length >= item.frames:
+        return solve_one(item, rank, generator)
+    starts = window_starts(item.frames, replace(params, length=length))
     status = Status("ok", f"{len(starts)} windows of {length} frames")
     whole: dict[str, Tensor] = {}
     for number, first in enumerate(starts):
@@ -87,6 +93,27 @@ def solve_windows(
         whole.pop("points3d"), whole.pop("rotations"), rank=rank, status=status, observed=item.visible, **whole
     )
     return result if float(mirror_sign(result.points3d)) > 0 else result.mirrored()
+
+
+@torch.no_grad()
+def _telling_length(
+    item: Tracks,
+    rank: int,
+    generator: torch.Generator,
+    solve_one: Callable[[Tracks, int, torch.Generator], Reconstruction],
+    params: WindowParams,
+) -> int:
+    """The least length, doubled from that of the parameters, at which the view turns enough in every window."""
+    every = -(-2 * item.frames // params.length)
+    survey = solve_one(item.select(frames=slice(None, None, every)), rank, generator).rotations
+    length = params.length
+    while length < item.frames:
+        starts = window_starts(item.frames, replace(params, length=length))
+        views = [survey[first // every : (first + length) // every] for first in starts]
+        if min(float(turn_of_view(view)) for view in views) >= params.turn:
+            break
+        length *= 2
+    return length
 
 
 def _faded(earlier: Tensor, later: Tensor, first: int) -> Tensor:
