@@ -206,6 +206,21 @@ def test_film_shows_what_is_tracked_more_or_all(generator):
     assert tracked.sum() < held.sum() <= always.sum()
 
 
+def test_a_tracker_holds_fewer_points_the_faster_they_are(generator):
+    speed = torch.tensor([0.0, 0.02, -0.02, 0.06, -0.06]).repeat(600)
+    way = torch.arange(12)[:, None, None] * speed[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    points = torch.randn(3000, 3, generator=generator) + way
+    visible, eye = torch.ones(12, 3000, dtype=torch.bool), torch.eye(3).expand(12, 3, 3)
+    how = replace(AS_TRACKED, points=(3000, 3001), life=(1e6, 1e6), speed=(0.02, 0.02), shortest=(1, 1))
+    film = augment(Film(points.float(), visible, eye, torch.full((3000,), 0.1), 0), how, generator)
+    pace = (film.points3d[1] - film.points3d[0])[:, 0].abs()
+    still, slow, fast = ((pace - value).abs() < 1e-4 for value in (0.0, 0.02, 0.06))
+    held = torch.tensor([float(film.visible[:, group].sum()) / 12 for group in (still, slow, fast)])
+    # A quarter of the time is between two lives; of the rest half is lost at that speed, at three times it 3 of 4.
+    expected = 0.75 * torch.tensor([600 * 1.0, 1200 * 0.5, 1200 * 0.25])
+    torch.testing.assert_close(held, expected, rtol=0.1, atol=0)
+
+
 def test_overfits_eight_clips(generator):
     torch.manual_seed(0)
     params = ReadOut(size=16)

@@ -61,7 +61,7 @@ class Augmentation:
         thin: lowest and highest power of the thickness of a part with which its points are tracked: few windows fit on
             a thin part, so a tracker has fewer points on a forearm than its area would give.
         speed: lowest and highest speed in the image against the body's mean, metres per frame, at which every second
-            track is lost.
+            track is lost; at twice that speed two of three are, and so on.
         life: shortest and longest life of a track, frames; between lives a point is lost for a third of a life.
         shortest: fewest and most frames that a track must live to be one: a limb that is fast nearly always has none.
         shown: odds that a film shows each point while it is tracked, for a while before and after too, or always:
@@ -210,8 +210,9 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     clock = torch.arange(frames)[:, None] / (life * 4 / 3) + uniform(0, 1, wanted)
     alive = visible & (clock.remainder(1.0) < 0.75)
     # A tracker loses what is fast in the image against the rest of the body; some windows hold on longer than others.
+    # Gradually, as on real tracks: were fast limbs never seen, their absence would be what names a jump.
     pace = _image_speed(points3d, visible) / uniform(*how.speed)
-    alive = alive & (uniform(0, 1, wanted) < 1 / (1 + pace**3))
+    alive = alive & (uniform(0, 1, wanted) < 1 / (1 + pace))
     alive = _lasting(alive, int(torch.randint(how.shortest[0], how.shortest[1] + 1, (), generator=generator)))
     visible = torch.where(alive.any(1, keepdim=True), alive, visible)
     kept = visible.any(0)
