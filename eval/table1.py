@@ -26,7 +26,7 @@ from eval.scoring import PAPER, bootstrap_cells, draw, error_by_action, table_te
 from eval.sequences import ACTIONS, Filmed, Filming, Sequence, mocap_sequences, synthetic_sequences
 from torchrecon.errors import ReconError
 from torchrecon.metrics import error3d_camera, nrmse
-from torchrecon.models.recogniser import Recogniser, classify_windows, load_recogniser
+from torchrecon.models.recogniser import AROUND, Recogniser, classify_windows, load_recogniser
 
 __all__ = ["main", "run", "score"]
 
@@ -83,7 +83,7 @@ def _read(
     """
     wrong, windows = [], 0
     for recogniser in recognisers:
-        named = classify_windows(recogniser, points3d, visible, filmed.rotations).predicted.tolist()
+        named = classify_windows(recogniser, points3d, visible, filmed.rotations, around=AROUND).predicted.tolist()
         wrong.append(sum(recogniser.classes[index] != action for index in named))
         windows = len(named)
     return wrong, windows

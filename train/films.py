@@ -26,7 +26,7 @@ from torchrecon.data.synthetic import (
     static_camera,
     turning_camera,
 )
-from torchrecon.models.views import ReadOut, hold_last, pictures, settle, yaws_of
+from torchrecon.models.views import ReadOut, held, hold_last, pictures, settle, yaws_of
 
 WINDOW = 32
 """Frames that the recogniser looks at."""
@@ -61,7 +61,8 @@ class Augmentation:
         thin: lowest and highest power of the thickness of a part with which its points are tracked: few windows fit on
             a thin part, so a tracker has fewer points on a forearm than its area would give.
         speed: lowest and highest speed in the image against the body's mean, metres per frame, at which every second
-            track is lost; at twice that speed two of three are, and so on.
+            track is lost.
+        steep: lowest and highest power with which the loss grows with the speed beyond that.
         life: shortest and longest life of a track, frames; between lives a point is lost for a third of a life.
         shortest: fewest and most frames that a track must live to be one: a limb that is fast nearly always has none.
         shown: odds that a film shows each point while it is tracked, for a while before and after too, or always:
@@ -81,6 +82,7 @@ class Augmentation:
     crowding: float = 1.0
     thin: tuple[float, float] = (0.5, 4.0)
     speed: tuple[float, float] = (0.007, 0.06)
+    steep: tuple[float, float] = (1.0, 3.0)
     life: tuple[int, int] = (8, 60)
     shortest: tuple[int, int] = (1, 8)
     shown: tuple[float, float, float] = (0.5, 0.25, 0.25)
@@ -97,6 +99,7 @@ AS_TRACKED = Augmentation(
     points=(600, 601),
     thin=(2.0, 2.0),
     speed=(0.02, 0.02),
+    steep=(1.0, 1.0),
     life=(8, 30),
     shortest=(5, 5),
     shown=(1.0, 0.0, 0.0),
@@ -210,8 +213,8 @@ def augment(film: Film, how: Augmentation, generator: torch.Generator) -> Film:
     clock = torch.arange(frames)[:, None] / (life * 4 / 3) + uniform(0, 1, wanted)
     alive = visible & (clock.remainder(1.0) < 0.75)
     # A tracker loses what is fast in the image against the rest of the body; some windows hold on longer than others.
-    # Gradually, as on real tracks: were fast limbs never seen, their absence would be what names a jump.
-    pace = _image_speed(points3d, visible) / uniform(*how.speed)
+    # Mostly gradually, as on real tracks: were fast limbs never seen, their absence would be what names a jump.
+    pace = (_image_speed(points3d, visible) / uniform(*how.speed)) ** uniform(*how.steep)
     alive = alive & (uniform(0, 1, wanted) < 1 / (1 + pace))
     alive = _lasting(alive, int(torch.randint(how.shortest[0], how.shortest[1] + 1, (), generator=generator)))
     visible = torch.where(alive.any(1, keepdim=True), alive, visible)
@@ -244,8 +247,7 @@ def _held(visible: Tensor, how: Augmentation, generator: torch.Generator) -> Ten
     """The entries that a method would stand for: those tracked, some more around them, or all."""
     kind = int(torch.multinomial(torch.tensor(how.shown), 1, generator=generator))
     hold = (0, int(torch.randint(1, how.hold + 1, (), generator=generator)), len(visible))[kind]
-    grown = F.max_pool1d(visible.T.float(), 2 * hold + 1, stride=1, padding=hold) if hold < len(visible) else None
-    return torch.ones_like(visible) if grown is None else grown.T > 0
+    return held(visible, hold) if hold < len(visible) else torch.ones_like(visible)
 
 
 def flat(film: Film, share: float = 0.0) -> Film:

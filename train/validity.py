@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrecon.models.recogniser import Recogniser, classify_windows
+from torchrecon.models.recogniser import AROUND, Recogniser, classify_windows
 from train.films import AS_TRACKED, Film, augment, flat
 
 TRUE_AT_MOST, FLAT_AT_LEAST = 3.0, 25.0
@@ -32,9 +32,12 @@ class Reading(NamedTuple):
 
 
 def read_films(recogniser: Recogniser, films: Iterable[Film]) -> list[Reading]:
-    """A reading of each film, with the windows and yaws of Table 1."""
+    """A reading of each film, with the windows, yaws and frames around of Table 1."""
     return [
-        Reading(film.label, classify_windows(recogniser, film.points3d, film.visible, film.rotations).probabilities)
+        Reading(
+            film.label,
+            classify_windows(recogniser, film.points3d, film.visible, film.rotations, around=AROUND).probabilities,
+        )
         for film in films
     ]
 
@@ -96,7 +99,7 @@ def validity(recogniser: Recogniser, films: list[Film], sources: Sequence[str] |
     """The error on true 3D and on the same points without depth, on bodies that were not trained on.
 
     Twice: every point that is tracked at some time, in all frames, which decides whether the protocol is valid; and
-    ``as_tracked``, the points only while they are tracked, which says what the gaps alone cost. For the recogniser
+    ``as_tracked``, the points only while they are tracked and shortly around, which says what the gaps alone cost. For the recogniser
     of 2D views with and without depth are one and the same, so there is nothing to be valid.
 
     Args:

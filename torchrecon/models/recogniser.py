@@ -23,9 +23,10 @@ from torch import nn
 
 from torchrecon._typing import Bool, Float, Int, Tensor
 from torchrecon.errors import ReconError
-from torchrecon.models.views import ReadOut, hold_last, pictures, read_out, settle, yaws_of
+from torchrecon.models.views import ReadOut, held, hold_last, pictures, read_out, settle, yaws_of
 
 __all__ = [
+    "AROUND",
     "ReadOut",
     "Recogniser",
     "WindowScores",
@@ -36,6 +37,12 @@ __all__ = [
     "weights_hash",
     "yaws_of",
 ]
+
+AROUND = 4
+"""Frames around those in which a point was seen, 0.16 s at 25 frames per second, in which Table 1 shows it too: every
+method says where it is, and a fast limb that the tracker lost for a moment is no sign of an action. Chosen on films of
+training seeds that the tracker had followed, by what is made of true 3D alone: 22 % of the windows of standing
+cameras' jumps are misread without it, 1 % with it (2 frames: 6 %)."""
 
 _READ_OUT = ReadOut()
 
@@ -123,6 +130,7 @@ def classify_windows(
     camera_rotations: Float[Tensor, "frames 3 3"],
     window: int = 32,
     stride: int = 4,
+    around: int = 0,
 ) -> WindowScores:
     """Name the action in every window of a clip, averaged over the world yaws of the read-out.
 
@@ -131,6 +139,7 @@ def classify_windows(
     Args:
         points3d, visible, camera_rotations: as for :func:`read_out`.
         window, stride: frames.
+        around: frames before and after it was seen in which a point is shown too, where ``points3d`` is finite.
 
     Example:
         >>> scores = classify_windows(
@@ -142,6 +151,8 @@ def classify_windows(
         >>> scores.probabilities.shape
         torch.Size([3, 2])
     """
+    if around:
+        visible = held(visible, around) & torch.isfinite(points3d).all(-1)
     settled = settle(points3d, visible, camera_rotations, recogniser.params)
     dtype = next(recogniser.parameters()).dtype
     mean = torch.zeros((), dtype=dtype, device=settled.world.device)

@@ -17,7 +17,7 @@ from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.errors import ReconError
 from torchrecon.render.splat import splat
 
-__all__ = ["ReadOut", "Settled", "hold_last", "pictures", "read_out", "settle", "yaws_of"]
+__all__ = ["ReadOut", "Settled", "held", "hold_last", "pictures", "read_out", "settle", "yaws_of"]
 
 _VIEWS = ("side", "top", "camera")
 
@@ -96,6 +96,17 @@ def read_out(
         torch.Size([2, 5, 24, 24])
     """
     return pictures(settle(points3d, visible, camera_rotations, params), params, yaw, frames)
+
+
+def held(visible: Bool[Tensor, "frames points"], frames: int) -> Bool[Tensor, "frames points"]:
+    """Each stretch in which a point is seen, longer by ``frames`` at both ends.
+
+    Example:
+        >>> held(torch.tensor([0, 0, 0, 1, 0, 0])[:, None] > 0, 2)[:, 0].int().tolist()
+        [0, 1, 1, 1, 1, 1]
+    """
+    reach = min(frames, len(visible))
+    return torch.nn.functional.max_pool1d(visible.T.float(), 2 * reach + 1, stride=1, padding=reach).T > 0
 
 
 class Settled(NamedTuple):

@@ -10,7 +10,6 @@ The model is in ``shape_likelihood``; the search is derived here.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -26,8 +25,8 @@ from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
-from torchrecon.nrsfm.relief import ReliefParams, deeper_answer
-from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.relief import ReliefParams, other_depth
+from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, cost_of_modes, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
 from torchrecon.nrsfm.spread import SpreadParams, posterior_covariance, refitted, widened
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
@@ -44,7 +43,7 @@ class MarginalParams:
         descent: of the quasi-Newton descent.
         smoothing: of noisy tracks over time, before anything else.
         spread: of the refits that tell how far the points may be off.
-        relief: of the search for a deeper shape that explains the tracks as well.
+        relief: of the search for a shape of other depth that explains the tracks as well.
         coarse, fine: first and last standard deviation of the residual.
         finest: how far below ``fine`` the residual goes on falling while no new mode appears.
         levels: number of residual levels, geometric from coarse to fine (count).
@@ -166,13 +165,15 @@ def solve_marginal(
     turn = float(turn_of_view(model.rotations[0].detach()))
     if turn < params.relief.turn:
         level = _told_noise(fixed, params)
-        other = deeper_answer(
+        other = other_depth(
             fixed, model, answer, eps, params.modes, level, draws, params.steps, params.relief, params.descent
         )
         if other is not None:
             away = (other - answer.points[0]).detach()
             covariance = covariance + away[..., :, None] * away[..., None, :]
-            doubt = f"a deeper shape explains views that turn by {turn:.0f} degrees as well; they do not determine depth"
+            doubt = (
+                f"shapes of other depth explain views that turn by {turn:.0f} degrees as well; depth is not determined"
+            )
     complaint = None if converged else "the likelihood still rose when the rounds of growth and descent were over"
     # What makes the body larger in one frame, the camera or the shape, is not told apart: ``points3d`` is in
     # pixels of the tracks in every frame.
@@ -241,9 +242,7 @@ def _search(
     stiff = _rigid_model(complete, rotations)
     for residual in (params.coarse, eps):
         stiff, stiff_value, ended = descend(views, stiff, residual, params.rigid_steps, params.descent)
-    # Every mode costs what its numbers can explain of pure noise (Schwarz 1978).
-    cost = 0.5 * model.loadings[0].numel() * math.log(2 * int(views.visible.sum()))
-    if float(stiff_value.min()) < float(value) + cost:
+    if float(stiff_value.min()) < float(value) + cost_of_modes(views, model):
         return stiff.pick(int(stiff_value.argmin())), eps, len(rotations), ended
     return model, eps, len(rotations), converged
 

@@ -1,9 +1,9 @@
-"""Whether tracks can tell a shape from a deeper one whose view turns less (bas-relief).
+"""Whether tracks can tell a shape from a deeper one whose view turns less, or a shallower one (bas-relief).
 
 Under parallel rays a body that turns a little and a deeper body that turns less look nearly alike, and deformation can
 take up the rest. So the answer is made deeper about its mean view, its turns out of the image are made smaller by the
-same factor, and the search goes on from there. Where it ends in another shape that explains the tracks as well, the
-depth is not determined, whatever the covariance around one optimum says.
+same factor, and the search goes on from there; then the same with a shallower one. Where it ends in another shape that
+explains the tracks as well, the depth is not determined, whatever the covariance around one optimum says.
 After Belhumeur, Kriegman and Yuille (IJCV 1999), who show the ambiguity for one view; the test is derived here.
 """
 
@@ -16,9 +16,17 @@ import torch
 from torchrecon._typing import Float, Tensor
 from torchrecon.linalg import nearest_rotation, rotation_angle, rotation_from_vector
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
-from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.shape_likelihood import (
+    Evaluation,
+    ShapeModel,
+    Views,
+    cost_of_modes,
+    evaluate,
+    grow_loadings,
+    tangents,
+)
 
-__all__ = ["ReliefParams", "deeper_answer", "made_deeper"]
+__all__ = ["ReliefParams", "made_deeper", "other_depth"]
 
 
 @dataclass(frozen=True)
@@ -27,11 +35,11 @@ class ReliefParams:
 
     Attributes:
         turn: change of view beyond which it is not needed (degrees).
-        factor: by which the body is made deeper (no unit).
+        factor: by which the body is made deeper, then shallower (no unit).
         coarse: first standard deviation of the residual (rms sizes of the tracks).
         levels: of the residual, geometric down to that of the answer (count).
         last_rounds: of growth and descent on the last level; the others have one (count).
-        evidence: what the answer has to gain over the deeper one (nats per observation). Public sequences whose view
+        evidence: what the answer has to gain over the other one (nats per observation). Public sequences whose view
             turns less than ``turn``: the one that is solved (error 0.018) gains 0.08, filmed by still, panning and
             hand-held cameras (error 0.1 to 0.6) all gain less than 0.022.
         differs: change of the points, relative to their extent, below which the search came back to the answer.
@@ -82,7 +90,7 @@ def made_deeper(model: ShapeModel, factor: float) -> ShapeModel:
 
 
 @torch.no_grad()
-def deeper_answer(
+def other_depth(
     views: Views,
     model: ShapeModel,
     answer: Evaluation,
@@ -94,7 +102,7 @@ def deeper_answer(
     params: ReliefParams,
     descent: DescentParams,
 ) -> Float[Tensor, "frames points 3"] | None:
-    """Points of a deeper shape that explains the tracks as well as the answer, camera axes; None where there is none.
+    """Points of a shape of other depth that explains the tracks as well, camera axes; None where there is none.
 
     Args:
         model, answer: batches of one.
@@ -103,14 +111,18 @@ def deeper_answer(
         steps: quasi-Newton steps of a round.
     """
     fall = (eps / params.coarse) ** (1 / (params.levels - 1))
-    deeper = made_deeper(model, params.factor)
-    for level in range(params.levels):
-        residual = params.coarse * fall**level
-        for _ in range(params.last_rounds if level == params.levels - 1 else 1):
-            deeper = grow_loadings(views, deeper, residual, modes, noise, draws)
-            deeper = grow_loadings(views, deeper, residual, modes, noise, draws)
-            deeper, value, _ = descend(views, deeper, residual, steps, descent)
-    points = evaluate(views, deeper, eps).points[0]
-    change = float((points - answer.points[0]).norm() / answer.points[0].norm())
-    gain = float(value - answer.value) / float(views.visible.sum())
-    return points if gain < params.evidence and change > params.differs else None
+    for factor in (params.factor, 1 / params.factor):
+        other = made_deeper(model, factor)
+        for level in range(params.levels):
+            residual = params.coarse * fall**level
+            for _ in range(params.last_rounds if level == params.levels - 1 else 1):
+                for _ in range(2):
+                    other = grow_loadings(views, other, residual, modes, noise, draws)
+                other, value, _ = descend(views, other, residual, steps, descent)
+        points = evaluate(views, other, eps).points[0]
+        change = float((points - answer.points[0]).norm() / answer.points[0].norm())
+        bends = cost_of_modes(views, other) - cost_of_modes(views, model)
+        gain = (float(value - answer.value) + bends) / float(views.visible.sum())
+        if gain < params.evidence and change > params.differs:
+            return points
+    return None

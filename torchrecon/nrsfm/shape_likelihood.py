@@ -13,6 +13,7 @@ Cost: linear in frames and in points. All leading dimensions are batch dimension
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -20,7 +21,7 @@ import torch
 from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.linalg import rotation_from_vector, skew
 
-__all__ = ["Evaluation", "ShapeModel", "Views", "evaluate", "grow_loadings", "moved", "tangents"]
+__all__ = ["Evaluation", "ShapeModel", "Views", "cost_of_modes", "evaluate", "grow_loadings", "moved", "tangents"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +105,11 @@ def tangents(mean: Float[Tensor, "*b points 3"]) -> Float[Tensor, "*b size 4"]:
     eye = torch.eye(3, dtype=mean.dtype, device=mean.device)
     turned = torch.linalg.cross(eye.expand(*mean.shape[:-1], 3, 3), mean[..., None, :].expand(*mean.shape[:-1], 3, 3))
     return torch.cat([turned.mT, mean[..., None]], -1).flatten(-3, -2)
+
+
+def cost_of_modes(views: Views, model: ShapeModel) -> float:
+    """What the loadings of an item must gain to be believed, nats (Schwarz 1978): so much they explain of noise."""
+    return 0.5 * model.loadings[0].numel() * math.log(2 * max(1, int(views.visible.sum())))
 
 
 def moved(model: ShapeModel, pose: Tensor, mean: Tensor, loadings: Tensor) -> ShapeModel:
