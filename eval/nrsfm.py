@@ -1,7 +1,8 @@
 """Solvers on sequences with known 3D: ``python -m eval.nrsfm [--data ../shared/data/nrsfm]``.
 
-With ``--data``: the field's eight public sequences, complete tracks, orthographic. Without: surface points of the
-synthetic world, seen in bands of 15 to 40 frames as real tracks are, pinhole camera turning about the player.
+With ``--data``: the field's eight public sequences, complete tracks, orthographic; or, where the folder is that of the
+keypoints, HumanEva: 15 joints of people before one real camera that stands (``--view``). Without: surface points of
+the synthetic world, seen in bands of 15 to 40 frames as real tracks are, pinhole camera turning about the player.
 One configuration, nothing chosen per sequence, and no K given unless ``--rank`` says so: ``paper`` takes the K that
 the papers of the known methods picked by hand for each sequence. Ground truth is read by the metric alone.
 """
@@ -11,18 +12,20 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
 import torchrecon as tr
+from eval import recordings
 from eval.job import provenance, write_json
-from torchrecon.data.benchmarks import SEQUENCES, load_benchmark
+from torchrecon.data.benchmarks import SEQUENCES, Benchmark, load_benchmark
 from torchrecon.data.synthetic import ACTIONS, SyntheticClip, sample_body, sample_motion, turning_camera
 from torchrecon.data.views import CAMERAS, degrade_tracks, film_again
 from torchrecon.errors import ReconError
-from torchrecon.metrics import error3d_akhter, error3d_camera
+from torchrecon.metrics import error3d_akhter, error3d_camera, pa_mpjpe
 
 __all__ = ["main"]
 
@@ -100,20 +103,36 @@ def band_tracks(action: str, seed: int, points: int, turn: float) -> tuple[tr.Tr
     return tr.Tracks(xy, visible, covariance, intrinsics=k), truth[:, index]
 
 
+def _is_keypoints(data: str | None) -> bool:
+    return data is not None and (Path(data) / recordings.FILE).is_file()
+
+
+def _public(name: str, arguments: argparse.Namespace) -> tuple[Benchmark, torch.Tensor]:
+    """A public sequence and its truth in the axes of the camera that is asked for."""
+    sequence = load_benchmark(name, arguments.data)
+    if arguments.camera == "orbit":
+        return sequence, sequence.points3d
+    if sequence.canonical is None:
+        raise ReconError(f"--camera {arguments.camera}: {name} has no world-frame truth to film again")
+    return sequence, film_again(sequence.canonical, sequence.points3d, arguments.camera)
+
+
 def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """One cell of the table."""
-    if arguments.data is not None:
-        sequence = load_benchmark(name, arguments.data)
-        truth, scale = sequence.points3d, "none"
-        if arguments.camera != "orbit":
-            if sequence.canonical is None:
-                raise ReconError(f"--camera {arguments.camera}: {name} has no world-frame truth to film again")
-            truth = film_again(sequence.canonical, truth, arguments.camera)
-        generator = torch.Generator().manual_seed(arguments.seed)
+    generator = torch.Generator().manual_seed(arguments.seed)
+    sequence = metres = None
+    scale: Literal["none", "sequence"] = "sequence"
+    if _is_keypoints(arguments.data):
+        xy, metres = recordings.recording(name, arguments.view, Path(arguments.data))
+        tracks = degrade_tracks(xy, arguments.noise, arguments.missing, arguments.gaps, generator=generator)
+        tracks = replace(tracks, fps=recordings.FPS)
+        truth = recordings.at_image_scale(metres, xy)
+    elif arguments.data is not None:
+        sequence, truth = _public(name, arguments)
+        scale = "none"
         tracks = degrade_tracks(truth[..., :2], arguments.noise, arguments.missing, arguments.gaps, generator=generator)
     else:
         tracks, truth = band_tracks(name, arguments.seed, arguments.points, arguments.turn)
-        scale = "sequence"
     rank = chosen_rank(arguments.rank, solver, name)
     start, cpu = time.perf_counter(), time.process_time()
     answer = tr.reconstruct(tracks, rank, solver=solver)
@@ -134,7 +153,11 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
         "cpu_seconds": cpu,
         "status": str(answer.statuses[0]),
     }
-    if arguments.data is not None:
+    if metres is not None:
+        # The better of the two mirror images, one for the sequence, as for error3d_camera.
+        both = (answer.points3d, answer.mirrored().points3d)
+        row["pa_mpjpe_mm"] = 1000 * min(float(pa_mpjpe(shape, metres)) for shape in both)
+    if sequence is not None:
         # Shapes in world axes where the sequence has them, else with the estimated camera applied.
         world = sequence.canonical is not None and name != "dance" and arguments.camera == "orbit"
         pair = (answer.canonical, sequence.canonical) if world else (answer.points3d, truth)
@@ -149,19 +172,28 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as text."""
     head = f"{'sequence':10s} {'solver':10s} {'error3d_camera':>14s} {'flat':>6s} {'K':>4s} {'s':>6s} {'CPU s':>6s}"
-    public = "reference" in rows[0]
+    public, people = "reference" in rows[0], "pa_mpjpe_mm" in rows[0]
+    width = max(10, *(len(row["sequence"]) for row in rows))
+    head = f"{'sequence':{width}s}" + head[10:] + (f" {'PA mm':>6s}  status" if people else "")
     lines = [head + (f" {'akhter':>7s} {'paper':>6s} {'PND2':>6s} {'best':>6s}" if public else "")]
     for row in rows:
-        line = f"{row['sequence']:10s} {row['solver']:10s} {row['error3d_camera']:14.4f} {row['flat']:6.3f}"
+        line = f"{row['sequence']:{width}s} {row['solver']:10s} {row['error3d_camera']:14.4f} {row['flat']:6.3f}"
         star = "*" if row["rank_from"] == "estimate" else " "
         line += f" {row['rank']:3d}{star} {row['seconds']:6.1f} {row['cpu_seconds']:6.1f}"
         if public:
             known = (row["reference"][key] for key in ("akhter", "pnd2", "best_known"))
             line += f" {row['error3d_akhter']:7.4f} " + " ".join("     -" if k is None else f"{k:6.4f}" for k in known)
+        if people:
+            line += f" {row['pa_mpjpe_mm']:6.0f}  {row['status'].split(':')[0]}"
         lines.append(line)
     note = "* K estimated from the tracks\nerror3d_camera: camera axes, centred per frame, one depth sign per sequence"
     legend = ["paper: error3d_akhter reported for the method, with its own K for each sequence"] if public else []
-    return "\n".join([*lines, note + ("" if public else ", one scale per sequence, observed entries"), *legend, ""])
+    if people:
+        legend = [
+            "at the scale of the image in every frame; PA mm: PA-MPJPE, millimetres, one mirror image per sequence"
+        ]
+    observed = "" if people else ", observed entries"
+    return "\n".join([*lines, note + ("" if public else f", one scale per sequence{observed}"), *legend, ""])
 
 
 def _gaps(text: str) -> tuple[int, int]:
@@ -175,11 +207,12 @@ def _gaps(text: str) -> tuple[int, int]:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and write ``nrsfm.json`` and ``nrsfm.txt``."""
     parser = argparse.ArgumentParser(prog="python -m eval.nrsfm", description=__doc__)
-    parser.add_argument("--data", metavar="DIR", help="folder of the public sequences; default: the synthetic world")
+    parser.add_argument("--data", metavar="DIR", help="nrsfm/ or keypoints/ folder; default: the synthetic world")
     parser.add_argument("--sequence", nargs="+", metavar="NAME", help="default: all")
     parser.add_argument("--solver", nargs="+", default=["auto"], metavar="NAME")
     parser.add_argument("--rank", default="auto", metavar="auto|paper|K", help="number of shape bases")
     parser.add_argument("--camera", default="orbit", choices=("orbit", *CAMERAS), help="of the public sequences")
+    parser.add_argument("--view", type=int, default=0, choices=range(recordings.CAMERAS), help="camera of HumanEva")
     parser.add_argument("--noise", type=float, default=0.0, metavar="S", help="std, share of the largest coordinate")
     parser.add_argument("--missing", type=float, default=0.0, metavar="SHARE", help="share of entries not seen")
     parser.add_argument("--gaps", type=_gaps, metavar="A-B", help="frames of a gap; default: entries drop out singly")
@@ -188,9 +221,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--out", default="runs/nrsfm", metavar="DIR")
     options = parser.parse_args(arguments)
-    known = SEQUENCES if options.data is not None else ACTIONS[:5]
     rows: list[dict[str, Any]] = []
     try:
+        if _is_keypoints(options.data):
+            known = tuple(recordings.recordings(Path(options.data)))
+        else:
+            known = SEQUENCES if options.data is not None else ACTIONS[:5]
         for name in options.sequence or known:
             if name not in known:
                 raise ReconError(f"--sequence {name}: is not one of {', '.join(known)}")

@@ -99,8 +99,8 @@ def validity(recogniser: Recogniser, films: list[Film], sources: Sequence[str] |
     """The error on true 3D and on the same points without depth, on bodies that were not trained on.
 
     Twice: every point that is tracked at some time, in all frames, which decides whether the protocol is valid; and
-    ``as_tracked``, the points only while they are tracked and shortly around, which says what the gaps alone cost. For the recogniser
-    of 2D views with and without depth are one and the same, so there is nothing to be valid.
+    ``as_tracked``, the points only while they are tracked and shortly around, which says what the gaps alone cost. For
+    the recogniser of 2D views with and without depth are one and the same, so there is nothing to be valid.
 
     Args:
         sources: where each film comes from; the errors on true 3D are then also given ``by_source``.
