@@ -121,7 +121,8 @@ def other_depth(
                 other, value, _ = descend(views, other, residual, steps, descent)
         points = evaluate(views, other, eps).points[0]
         change = float((points - answer.points[0]).norm() / answer.points[0].norm())
-        bends = cost_of_modes(views, other) - cost_of_modes(views, model)
+        # Against a rigid body the modes of the other one have to prove themselves; two families are equals.
+        bends = 0.0 if model.loadings.shape[-1] else cost_of_modes(views, other)
         gain = (float(value - answer.value) + bends) / float(views.visible.sum())
         if gain < params.evidence and change > params.differs:
             return points
