@@ -311,3 +311,10 @@ def test_a_fixed_view_that_shifts_says_nothing_of_depth():
     flat = torch.cat([truth[..., :2], torch.zeros(40, 50, 1)], -1)
     bar = error3d_camera(flat, truth, visible, align_scale="sequence")
     assert error3d_camera(rec.points3d, truth, visible, align_scale="sequence") < 1.1 * bar
+
+
+def test_a_rigid_fit_whose_views_do_not_turn_is_flat_and_not_huge():
+    made = low_rank_tracks(60, 30, 1, 40.0, 0, motion="swing")  # its size changes, which no rigid body's does
+    rec = get_solver("rigid")(Tracks(made.xy), 1)
+    assert rec.status.code == "undetermined"
+    assert float(rec.points3d[..., 2].abs().max()) == 0.0

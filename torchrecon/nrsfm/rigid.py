@@ -172,6 +172,8 @@ def rigid(
         points3d, rotations = points3d * flip, rotations * (flip[:, None] * flip)
         status = check_size(item, 1)
         turn = float(turn_of_view(rotations))
+        if turn < STATIC_TURN:  # what the views do not tell would be divided by how little they turn
+            points3d = points3d * points3d.new_tensor([1.0, 1.0, 0.0])
         if status is None and turn < STATIC_TURN:
             status = Status("undetermined", f"the view turns by only {turn:.1f} degrees; depth is not determined")
         if status is None and not converged:
