@@ -53,9 +53,9 @@ def solve_true_rotations(tracks: Tracks, context: Context) -> RowOutput:
     path = CameraPath(turn, shift, torch.zeros_like(data.tracks.times))
     noise = params.inflation if data.noise_known else params.default_noise
     with torch.no_grad():
-        prior = learn_kernels(
-            pack(data, thinning(data, params)), path, _prior(data, params), noise,
-            weight=params.kernel_weight, iterations=params.kernel_iterations,
-        )  # fmt: skip
+        thin, prior = pack(data, thinning(data, params)), _prior(data, params)
+        rounds = ((params.kernel_weight, params.kernel_iterations), (params.last_weight, params.last_iterations))
+        for weight, iterations in rounds:
+            prior = learn_kernels(thin, path, prior, noise, weight=weight, iterations=iterations)
         canonical, _, _ = posterior_points(pack(data), path, prior, noise)
     return RowOutput(canonical @ turn.mT, tracks.visible, "true rotations")

@@ -59,6 +59,8 @@ class TrajectoryParams:
         drift_memory: its time scale (seconds).
         kernel_weight: weight of the Matern kernels against the learned ones (coordinates, three per point).
         kernel_iterations: rounds of learning the kernels (count).
+        last_weight, last_iterations: of learning on from these once the path is found. Kernels as free as that choose
+            wrong paths; under the right one they follow the limbs better.
         static_turn: change of view below which depth is called undetermined (degrees): a fixed camera on a moving
             person fits turns of 25 to 45 degrees.
         evidence: what a turn has to gain over a fixed view for depth to be called determined, and with measured depth
@@ -82,6 +84,8 @@ class TrajectoryParams:
     drift_memory: float = 0.4
     kernel_weight: float = 100.0
     kernel_iterations: int = 5
+    last_weight: float = 30.0
+    last_iterations: int = 24
     static_turn: float = 60.0
     evidence: float = 0.06
 
@@ -355,15 +359,20 @@ def solve_trajectories(
     Gradients go through the posterior of the points, with camera path and kernels held.
     """
     params = params or TrajectoryParams()
-    data = observe(item)
-    found = find_path(observe(item.detach()), params)
+    data, held = observe(item), observe(item.detach())
+    found = find_path(held, params)
+    with torch.no_grad():
+        thin = pack(held, thinning(held, params))
+        prior = learn_kernels(
+            thin, found.path, found.prior, found.noise, weight=params.last_weight, iterations=params.last_iterations
+        )
     packed, path = pack(data), found.path
     if packed.perspective and item.depth is None and not found.speed.any():
         packed, path = _parallel(packed, path)
-    canonical, spread, _ = posterior_points(packed, path, found.prior, found.noise)
+    canonical, spread, _ = posterior_points(packed, path, prior, found.noise)
     if item.depth is not None and item.intrinsics is not None:
         found = replace(found, path=_at_distance(data, item.depth, found.path, canonical))
-        canonical, spread, _ = posterior_points(packed, found.path, found.prior, found.noise)
+        canonical, spread, _ = posterior_points(packed, found.path, prior, found.noise)
     return place_points(data, found, canonical, spread, rank, params)
 
 
