@@ -19,8 +19,9 @@ from typing import Any, Literal
 import torch
 
 import torchrecon as tr
-from eval import recordings
 from eval.job import provenance, write_json
+from eval.recordings import CAMERAS as VIEWS
+from eval.recordings import FILE, FPS, at_image_scale, recording, recordings
 from torchrecon.data.benchmarks import SEQUENCES, Benchmark, load_benchmark
 from torchrecon.data.synthetic import ACTIONS, SyntheticClip, sample_body, sample_motion, turning_camera
 from torchrecon.data.views import CAMERAS, degrade_tracks, film_again
@@ -104,7 +105,7 @@ def band_tracks(action: str, seed: int, points: int, turn: float) -> tuple[tr.Tr
 
 
 def _is_keypoints(data: str | None) -> bool:
-    return data is not None and (Path(data) / recordings.FILE).is_file()
+    return data is not None and (Path(data) / FILE).is_file()
 
 
 def _public(name: str, arguments: argparse.Namespace) -> tuple[Benchmark, torch.Tensor]:
@@ -123,10 +124,10 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
     sequence = metres = None
     scale: Literal["none", "sequence"] = "sequence"
     if _is_keypoints(arguments.data):
-        xy, metres = recordings.recording(name, arguments.view, Path(arguments.data))
+        xy, metres = recording(name, arguments.view, Path(arguments.data))
         tracks = degrade_tracks(xy, arguments.noise, arguments.missing, arguments.gaps, generator=generator)
-        tracks = replace(tracks, fps=recordings.FPS)
-        truth = recordings.at_image_scale(metres, xy)
+        tracks = replace(tracks, fps=FPS)
+        truth = at_image_scale(metres, xy)
     elif arguments.data is not None:
         sequence, truth = _public(name, arguments)
         scale = "none"
@@ -212,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--solver", nargs="+", default=["auto"], metavar="NAME")
     parser.add_argument("--rank", default="auto", metavar="auto|paper|K", help="number of shape bases")
     parser.add_argument("--camera", default="orbit", choices=("orbit", *CAMERAS), help="of the public sequences")
-    parser.add_argument("--view", type=int, default=0, choices=range(recordings.CAMERAS), help="camera of HumanEva")
+    parser.add_argument("--view", type=int, default=0, choices=range(VIEWS), help="camera of HumanEva")
     parser.add_argument("--noise", type=float, default=0.0, metavar="S", help="std, share of the largest coordinate")
     parser.add_argument("--missing", type=float, default=0.0, metavar="SHARE", help="share of entries not seen")
     parser.add_argument("--gaps", type=_gaps, metavar="A-B", help="frames of a gap; default: entries drop out singly")
@@ -224,7 +225,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows: list[dict[str, Any]] = []
     try:
         if _is_keypoints(options.data):
-            known = tuple(recordings.recordings(Path(options.data)))
+            known = tuple(recordings(Path(options.data)))
         else:
             known = SEQUENCES if options.data is not None else ACTIONS[:5]
         for name in options.sequence or known:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from eval.recordings import CAMERAS, at_image_scale, recording, recordings
 from torchrecon.data.benchmarks import SEQUENCES, load_benchmark
 from torchrecon.errors import ReconError
 from torchrecon.metrics import error3d_akhter
@@ -48,3 +49,15 @@ def test_missing_data_is_named(tmp_path):
         load_benchmark("yoga", tmp_path)
     with pytest.raises(ReconError, match="not one of"):
         load_benchmark("jog", tmp_path)
+
+
+def test_humaneva_is_seen_by_the_camera_that_its_pixels_tell_of(data_dir):
+    folder = data_dir / "keypoints"
+    for name in recordings(folder)[:2]:
+        for camera in range(CAMERAS):
+            xy, metres = recording(name, camera, folder)
+            seen = at_image_scale(metres, xy)[..., :2]
+            seen, flat = (part - part.mean(1, keepdim=True) for part in (seen, xy))
+            # what is left is perspective within the body
+            assert float((seen - flat).norm() / flat.norm()) < 0.08
+            assert float((metres - metres.mean(1, keepdim=True)).norm(dim=-1).max()) < 2.0  # a person, in metres
