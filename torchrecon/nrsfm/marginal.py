@@ -239,12 +239,12 @@ def _search(
             break
         eps, level, before = eps * fall, level + 1, modes
     # Modes that come in before the views are right can stand for a turn: a body that does not bend is tried as well.
-    stiff = _rigid_model(complete, rotations)
+    stiff, cost = _rigid_model(complete, rotations), cost_of_modes(views, model)
     for residual in (params.coarse, eps):
         stiff, stiff_value, ended = descend(views, stiff, residual, params.rigid_steps, params.descent)
-    if float(stiff_value.min()) < float(value) + cost_of_modes(views, model):
-        return stiff.pick(int(stiff_value.argmin())), eps, len(rotations), ended
-    return model, eps, len(rotations), converged
+        if float(stiff_value.min()) >= float(evaluate(views, model, residual).value) + cost:
+            return model, eps, len(rotations), converged
+    return stiff.pick(int(stiff_value.argmin())), eps, len(rotations), ended
 
 
 def _shapeless(data: Observations) -> Status | None:
