@@ -172,10 +172,12 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as text."""
-    head = f"{'sequence':10s} {'solver':10s} {'error3d_camera':>14s} {'flat':>6s} {'K':>4s} {'s':>6s} {'CPU s':>6s}"
     public, people = "reference" in rows[0], "pa_mpjpe_mm" in rows[0]
     width = max(10, *(len(row["sequence"]) for row in rows))
-    head = f"{'sequence':{width}s}" + head[10:] + (f" {'PA mm':>6s}  status" if people else "")
+    head = (
+        f"{'sequence':{width}s} {'solver':10s} {'error3d_camera':>14s} {'flat':>6s} {'K':>4s} {'s':>6s} {'CPU s':>6s}"
+    )
+    head += f" {'PA mm':>6s}  status" if people else ""
     lines = [head + (f" {'akhter':>7s} {'paper':>6s} {'PND2':>6s} {'best':>6s}" if public else "")]
     for row in rows:
         line = f"{row['sequence']:{width}s} {row['solver']:10s} {row['error3d_camera']:14.4f} {row['flat']:6.3f}"
@@ -225,6 +227,10 @@ def main(arguments: list[str] | None = None) -> int:
     rows: list[dict[str, Any]] = []
     try:
         if _is_keypoints(options.data):
+            if options.camera != "orbit":
+                raise ReconError(
+                    f"--camera {options.camera}: HumanEva is taken as filmed; --view picks a camera"
+                )
             known = tuple(recordings(Path(options.data)))
         else:
             known = SEQUENCES if options.data is not None else ACTIONS[:5]

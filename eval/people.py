@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 import torchrecon as tr
+from eval.recordings import FILE, recordings
 from torchrecon.data.mocap import MocapClip, load_mocap
 from torchrecon.data.synthetic import ACTIONS, sample_body, sample_motion, static_camera
-from torchrecon.errors import ReconError
 from torchrecon.io.readers.layouts import HUMANEVA_15
 
 __all__ = ["FOLDS", "NAMES", "SCORED", "Person", "captured", "few", "folds_of", "humaneva", "synthetic"]
@@ -109,15 +109,12 @@ def captured(folder: Path, seed: int) -> list[Person]:
 
 def humaneva(folder: Path) -> list[Person]:
     """Every recording by each of its three cameras, as filmed; at 30 Hz and at most 4 s."""
-    file = folder / "keypoints" / "humaneva15_train.npz"
-    if not file.is_file():
-        raise ReconError(f"{file}: no such file; --data must be the folder that holds keypoints/ and mocap/")
     rename = {"thorax": "neck"} | {f"{side}_{j.split('_')[1]}": j for side in ("left", "right") for j in SCORED[1:]
                                    if j[0] == side[0]}  # fmt: skip
     names = [rename.get(name, name) for name in HUMANEVA_15.names]
-    people = []
-    with np.load(file, allow_pickle=False) as data:
-        for key in sorted(name.removesuffix("__xyz") for name in data.files if name.endswith("__xyz")):
+    people, keys = [], recordings(folder / "keypoints")
+    with np.load(folder / "keypoints" / FILE, allow_pickle=False) as data:
+        for key in keys:
             truth = torch.from_numpy(data[f"{key}__xyz"]).double()[::2][:HUMANEVA_FRAMES]
             for camera, xy in enumerate(data[f"{key}__xy"]):
                 tracks = tr.Tracks(torch.from_numpy(xy).double()[::2][:HUMANEVA_FRAMES], fps=30.0, names=names)

@@ -62,7 +62,7 @@ def recordings(folder: Path) -> list[str]:
     """
     file = folder / FILE
     if not file.is_file():
-        raise ReconError(f"{file}: no such file; --data must be the folder of the public sequences or of the keypoints")
+        raise ReconError(f"{file}: no such file; --data names no folder that holds the keypoints")
     with np.load(file, allow_pickle=False) as data:
         return sorted(name.removesuffix("__xyz") for name in data.files if name.endswith("__xyz"))
 
