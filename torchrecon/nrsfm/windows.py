@@ -3,7 +3,7 @@
 Overlapping windows are solved one after the other. In the frames that two windows share, the later one takes the
 mirror image and the canonical axes of the earlier one, and the answers fade into each other. A window can only know
 the depth if the view turns within it: a solve of every n-th frame says by how much, and where that is too little the
-windows grow, in the end to the whole sequence.
+windows grow, up to a limit.
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ class WindowParams:
         length: of a window (frames).
         overlap: of neighbouring windows, at least (frames).
         turn: by which the view has to change within a window (degrees).
+        most: length up to which windows grow for that: cost and memory stay linear (frames).
     """
 
     longest: int = 1000
     length: int = 500
     overlap: int = 60
     turn: float = 90.0
+    most: int = 2000
 
 
 def window_starts(frames: int, params: WindowParams) -> list[int]:
@@ -107,7 +109,7 @@ def _telling_length(
     every = -(-2 * item.frames // params.length)
     survey = solve_one(item.select(frames=slice(None, None, every)), rank, generator).rotations
     length = params.length
-    while length < item.frames:
+    while length < min(item.frames, params.most):
         starts = window_starts(item.frames, replace(params, length=length))
         views = [survey[first // every : (first + length) // every] for first in starts]
         if min(float(turn_of_view(view)) for view in views) >= params.turn:
