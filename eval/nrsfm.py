@@ -228,9 +228,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if _is_keypoints(options.data):
             if options.camera != "orbit":
-                raise ReconError(
-                    f"--camera {options.camera}: HumanEva is taken as filmed; --view picks a camera"
-                )
+                raise ReconError(f"--camera {options.camera}: HumanEva is taken as filmed; --view picks a camera")
             known = tuple(recordings(Path(options.data)))
         else:
             known = SEQUENCES if options.data is not None else ACTIONS[:5]
