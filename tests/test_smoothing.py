@@ -47,6 +47,14 @@ def test_shuffled_frames_pass_as_they_are(generator):
     assert smoothed(views, xy) is views
 
 
+def test_a_body_that_stands_still_under_noise_passes_as_it_is(generator):
+    xy = torch.randn(1, 1000, 2, generator=generator, dtype=torch.float64)
+    xy = xy + 0.05 * torch.randn(40, 1000, 2, generator=generator, dtype=torch.float64)
+    noise = 0.05**2 * torch.eye(2, dtype=torch.float64).expand(40, 1000, 2, 2)
+    views = Views(xy, torch.ones(40, 1000, dtype=torch.bool), noise)
+    assert smoothed(views, xy) is views
+
+
 def test_third_differences_read_the_noise_through_gaps(generator):
     exact = waves(300, 40, generator)
     xy = exact + 0.03 * torch.randn(exact.shape, generator=generator, dtype=torch.float64)

@@ -78,7 +78,8 @@ def smoothed(views: Views, complete: Float[Tensor, "frames points 2"], params: S
     power = _spectrum((basis.mT @ (complete - middle).flatten(1)).square().mean(1), params)
     gain = (1 - noise / power.clamp_min(torch.finfo(power.dtype).tiny)).clamp(0, 1)
     kept = gain.detach() > params.least_gain
-    if float(gain.detach()[kept].sum()) > (1 - params.worth) * frames:
+    # Where no frequency stands above the noise, time says nothing; a prior of nothing would say that all stands still.
+    if not bool(kept.any()) or float(gain.detach()[kept].sum()) > (1 - params.worth) * frames:
         return views
     basis, prior = basis[:, kept], (gain * power)[kept]
     precision = weight / variance.clamp_min(torch.finfo(variance.dtype).tiny)
