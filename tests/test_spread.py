@@ -7,6 +7,7 @@ import torch
 
 from eval.reliability.coverage import squared_distances
 from eval.reliability.world import low_rank_tracks
+from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Tracks
 from torchrecon.nrsfm.marginal import MarginalParams, solve_marginal
 from torchrecon.nrsfm.spread import SpreadParams, widened
@@ -36,11 +37,33 @@ def test_widened_finds_the_covariance_that_the_errors_have() -> None:
 
 def test_refits_make_the_closed_form_honest() -> None:
     levels = []
-    for draws in (0, 4):
+    for draws, halves in ((0, 0), (4, 2)):
         made = low_rank_tracks(40, 20, 1, 20.0, seed=3)
-        params = MarginalParams(spread=SpreadParams(draws=draws))
+        params = MarginalParams(spread=SpreadParams(draws=draws, halves=halves))
         answer = solve_marginal(Tracks(made.xy), 1, torch.Generator().manual_seed(0), params)
         distances = squared_distances(answer.points3d, answer.covariance3d, made.points3d)
         levels.append(float(distances.mean()) / 3)
     assert levels[0] > 2.5  # what the closed form states is too small by that factor in variance
     assert 0.6 < levels[1] < 1.5
+
+
+def test_halves_show_what_exact_tracks_leave_open() -> None:
+    g = torch.Generator().manual_seed(1)
+    time = torch.linspace(0, 1, 80, dtype=torch.float64)[:, None, None]
+    shape = torch.randn(20, 3, generator=g, dtype=torch.float64)
+    for k in range(1, 13):  # ever smaller deformations: no family of few modes holds them all
+        wave = torch.sin(torch.pi * (k + 1) * time + 6 * torch.rand(1, generator=g, dtype=torch.float64))
+        shape = shape + 0.3 / k**2 * wave * torch.randn(20, 3, generator=g, dtype=torch.float64)
+    turn = rotation_from_vector(10 * time[:, 0] * torch.tensor([0.1, 1.0, 0.05], dtype=torch.float64))
+    truth = shape @ turn.mT
+    truth = truth - truth.mean(1, keepdim=True)
+    held = []
+    for halves in (0, 2):
+        params = MarginalParams(spread=SpreadParams(halves=halves))
+        answer = solve_marginal(Tracks(truth[..., :2]), 2, torch.Generator().manual_seed(0), params)
+        depth = (answer.points3d - answer.points3d.mean(1, keepdim=True))[..., 2]
+        error = depth - truth[..., 2] * (depth * truth[..., 2]).sum().sign()  # the mirror is free
+        assert float(error.norm() / truth.norm()) < 0.02
+        held.append(float((error.abs() < 1.96 * answer.covariance3d[..., 2, 2].sqrt()).double().mean()))
+    assert held[0] < 0.5
+    assert held[1] > held[0] + 0.25

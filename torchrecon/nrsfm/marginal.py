@@ -28,7 +28,7 @@ from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.relief import ReliefParams, other_depth
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, cost_of_modes, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
-from torchrecon.nrsfm.spread import SpreadParams, posterior_covariance, refitted, widened
+from torchrecon.nrsfm.spread import SpreadParams, halved, posterior_covariance, refitted, widened
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
@@ -156,11 +156,14 @@ def solve_marginal(
     answer = evaluate(views, model, eps, with_spread=True)
     assert answer.spread is not None
     covariance = posterior_covariance(views, model, answer, eps)
-    # Where the noise is small beside the residual, refits show nothing that the closed form has not.
+    # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
     if params.spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
         smooth = partial(smoothed, params=params.smoothing)
         errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)
-        covariance = params.spread.calibration**2 * widened(covariance, errors, params.spread.window)
+        covariance = widened(covariance, errors, params.spread.window)
+    if params.spread.halves:
+        errors = halved(fixed, model, answer, eps, generator, params.spread, params.descent)
+        covariance = widened(covariance, errors, params.spread.window)
     doubt = None
     turn = float(turn_of_view(model.rotations[0].detach()))
     if turn < params.relief.turn:
