@@ -45,7 +45,7 @@ class MarginalParams:
         spread: of the refits that tell how far the points may be off.
         relief: of the search for a shape of other depth that explains the tracks as well.
         coarse, fine: first and last standard deviation of the residual.
-        finest: how far below ``fine`` the residual goes on falling while no new mode appears.
+        finest: how far below ``fine`` the residual of exact tracks goes on falling while no new mode appears.
         levels: number of residual levels, geometric from coarse to fine (count).
         trial_levels: levels after which the likeliest start is kept (count).
         starts: starts from the metric upgrade, lowest residual first (count).
@@ -236,9 +236,10 @@ def _search(
                 break
         if level == params.trial_levels - 1:
             model = model.pick(int(value.argmin()))
-        # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly.
+        # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly. Noise
+        # that hides further modes is no such sign.
         modes = model.loadings.shape[-1]
-        if level >= params.levels - 1 and (modes > before or eps * fall < params.finest):
+        if level >= params.levels - 1 and (noise > 0 or modes > before or eps * fall < params.finest):
             break
         eps, level, before = eps * fall, level + 1, modes
     # Modes that come in before the views are right can stand for a turn: a body that does not bend is tried as well.
