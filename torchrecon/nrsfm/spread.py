@@ -74,9 +74,16 @@ def posterior_covariance(
     return both @ both.mT + variance[:, None, None, None] * (eye - gain)
 
 
-def _copies(model: ShapeModel, count: int) -> ShapeModel:
+def _errors(
+    fitted: Views, shown: Views, model: ShapeModel, answer: Evaluation, eps: float, steps: int, descent: DescentParams
+) -> Float[Tensor, "refits frames points 3"]:
+    """How far fits to each of ``fitted``, begun at the model, move the points that they say of ``shown``; centred."""
+    count = len(fitted.xy)
     parts = (getattr(model, part.name) for part in fields(ShapeModel))
-    return ShapeModel(*(part.expand(count, *[-1] * (part.ndim - 1)).clone() for part in parts))
+    start = ShapeModel(*(part.expand(count, *[-1] * (part.ndim - 1)).clone() for part in parts))
+    again, _, _ = descend(fitted, start, eps, steps, descent)
+    away = evaluate(shown, again, eps).points - answer.points
+    return away - away.mean(-2, keepdim=True)
 
 
 @torch.no_grad()
@@ -110,9 +117,7 @@ def refitted(
         noisy = predicted + torch.where(seen, noise, noise.new_zeros(()))
         drawn.append(smooth(Views(noisy, measured.visible, measured.noise), noisy))
     views = Views(*(torch.stack([getattr(view, part.name) for view in drawn]) for part in fields(Views)))
-    again, _, _ = descend(views, _copies(model, params.draws), eps, params.steps, descent)
-    away = evaluate(views, again, eps).points - answer.points
-    return away - away.mean(-2, keepdim=True)
+    return _errors(views, views, model, answer, eps, params.steps, descent)
 
 
 @torch.no_grad()
@@ -141,9 +146,7 @@ def halved(
     kept = views.visible & ((time + begin) // length % 2 == 0)
     kept = torch.where(kept.sum(-1, keepdim=True) < params.least, views.visible, kept)
     some = Views(views.xy.expand(params.halves, -1, -1, -1), kept, views.noise.expand(params.halves, -1, -1, -1, -1))
-    again, _, _ = descend(some, _copies(model, params.halves), eps, params.half_steps, descent)
-    away = evaluate(views, again, eps).points - answer.points
-    return away - away.mean(-2, keepdim=True)
+    return _errors(some, views, model, answer, eps, params.half_steps, descent)
 
 
 def _average(values: Float[Tensor, "frames kinds"], half: int) -> Float[Tensor, "frames kinds"]:
