@@ -50,17 +50,13 @@ const count = (work) => new Promise((finish) => {
 (async () => {
   const idle = await count(() => {});
   document.getElementById("play").click();
-  const queued = [], drawn = [];
-  const busy = await count(() => {
-    document.body.dispatchEvent(turn);
-    const start = performance.now();
-    torchrecon.draw();
-    queued.push(performance.now() - start);
-  });
+  const busy = await count(() => document.body.dispatchEvent(turn)); // the page itself draws once a frame
   document.getElementById("play").click();
+  const queued = [], drawn = [];
   for (let i = 0; i < 30; i++) {
     const start = performance.now();
     torchrecon.draw();
+    queued.push(performance.now() - start);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
     drawn.push(performance.now() - start);
   }

@@ -19,13 +19,15 @@ const film = (() => {
     pictures.set(index, null);
     const end = starts[index] + D.film.sizes[index];
     createImageBitmap(new Blob([A.film.subarray(starts[index], end)], { type: "image/jpeg" })).then(
-      (bitmap) => { pictures.set(index, bitmap); refresh(); },
+      (bitmap) => { pictures.set(index, bitmap); if (index === wanted()) refresh(); },
       () => plea("One picture of the film cannot be decoded; the file may be damaged."),
     );
   }
 
+  const wanted = () => Math.min(Math.floor(S.frame / D.film.every), starts.length - 1);
+
   function picture() {
-    const now = Math.min(Math.floor(S.frame / D.film.every), starts.length - 1);
+    const now = wanted();
     for (let i = now; i <= now + AHEAD; i++) request(i);
     if (pictures.size > KEEP) {
       for (const [index, bitmap] of pictures) {

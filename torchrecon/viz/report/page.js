@@ -1,8 +1,11 @@
 // State, playing, keys and words.
 
-let stale = true, since = 0;
+// What has to be drawn again: nothing, the shape alone, or everything. A turn of the shape leaves the film as it is.
+const NOTHING = 0, SHAPE = 1, ALL = 2;
+let stale = NOTHING, since = 0;
 
-function refresh() { stale = true; }
+function refresh() { stale = ALL; }
+function refresh_shape() { stale = Math.max(stale, SHAPE); }
 
 function seek(frame) {
   S.frame = Math.max(0, Math.min(F - 1, frame));
@@ -75,7 +78,7 @@ function look_from(yaw, pitch, name) {
     S.yaw = from[0] + s * (yaw - from[0]);
     S.pitch = from[1] + s * (pitch - from[1]);
     S.zoom = from[2] + s * (1 - from[2]);
-    refresh();
+    refresh_shape();
     if (t < 1) requestAnimationFrame(step);
   };
   step(start);
@@ -212,10 +215,10 @@ function tick(now) {
   if (now - before > 500) since += now - before; // the page was hidden or busy: go on from where it was
   before = now;
   if (S.playing) advance(now);
-  if (stale) {
-    stale = false;
-    draw();
-  }
+  const part = stale;
+  stale = NOTHING;
+  if (part === ALL) draw();
+  else if (part === SHAPE) scene.draw();
   requestAnimationFrame(tick);
 }
 

@@ -366,11 +366,11 @@ const scene = (() => {
     S.pitch = Math.max(-Math.PI / 2, Math.min(Math.PI / 2, S.pitch + pitch));
     S.preset = null;
     show_view();
-    refresh();
+    refresh_shape();
   }
   function zoom(factor) {
     S.zoom = Math.max(0.3, Math.min(12, S.zoom * factor));
-    refresh();
+    refresh_shape();
   }
 
   return { open, draw, resize, recolour, turn, zoom, PRESETS, SIGMAS, cell: () => cell };
