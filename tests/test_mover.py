@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 import torch.nn.functional as F
 
-from torchrecon.contour import background_paths, find_mover, own_motion
+from torchrecon.contour import MoverParams, background_paths, find_mover, own_motion
 from torchrecon.errors import ReconError
 
 
@@ -43,6 +45,36 @@ def test_mover_is_found_before_a_still_and_a_drifting_camera(drift):
     overlap = [float((a & b).sum() / (a | b).sum()) for a, b in zip(found[2:-2], truth[2:-2], strict=True)]
     assert min(overlap) > 0.4
     assert sorted(overlap)[len(overlap) // 2] > 0.7
+
+
+def _swaying(height: int, width: int, amplitude: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """A disc of radius 16 that sways on the spot, before a still camera."""
+    wall = _texture(height, width, 5) * torch.tensor([0.5, 0.7, 1.0], dtype=torch.float32)[:, None, None]
+    skin = _texture(height, width, 1) * torch.tensor([1.0, 0.55, 0.4], dtype=torch.float32)[:, None, None]
+    y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    images, masks = [], []
+    for index in range(26):
+        sway = amplitude * math.sin(2 * math.pi * index / 24)
+        masks.append((x - width / 2 - sway) ** 2 + (y - height / 2) ** 2 < 16.0**2)
+        images.append(torch.where(masks[-1], torch.roll(skin, round(sway), 2), wall))
+    return images, masks
+
+
+def _overlap(images: list[torch.Tensor], truth: list[torch.Tensor], params: MoverParams) -> float:
+    found = find_mover(images, params)
+    return float(torch.stack([(a & b).sum() / (a | b).sum() for a, b in zip(found, truth, strict=True)]).mean())
+
+
+def test_motion_too_small_for_the_working_image_is_sought_in_a_larger_one():
+    images, truth = _swaying(240, 330, 6.0)
+    assert _overlap(images, truth, MoverParams(working_size=100)) > 0.8
+
+
+def test_small_mover_is_looked_at_from_nearer_by():
+    # Something is seen to move in the working image now and then; without a nearer look it is lost in most frames.
+    images, truth = _swaying(280, 600, 16.0)
+    assert _overlap(images, truth, MoverParams()) > 0.8
+    assert _overlap(images, truth, MoverParams(nearer=math.inf)) < 0.2
 
 
 def test_background_path_follows_the_camera_not_the_mover():

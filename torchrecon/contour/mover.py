@@ -1,15 +1,16 @@
 """Find the one thing that moves before a static or slowly drifting camera: masks without a mask.
 
 A first pass compares frames a few steps apart by dense optical flow, takes out the motion of the background (a
-homography), and collects where in the picture something moves on its own and which colours it has there. A second
-pass labels every frame by a graph cut (GrabCut) seeded with what moves now and with what those two maps say, so that
-parts of the body that rest for a while are still found.
+homography), and collects where in the picture something moves on its own and which colours it has there. Where nothing
+does, a picture twice as large is looked at; where that is a small part of the picture, as of a player filmed with the
+whole court, it is looked at again from nearer by. The last pass labels every frame by a graph cut (GrabCut) seeded with
+what moves now and with what those two maps say, so that parts of the body that rest for a while are still found.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -43,6 +44,8 @@ class MoverParams:
         step: frames between the two that are compared; slow motion needs more, 4 at 25 to 30 per second.
         least_motion: pixels of the working image by which something moves against the background in ``step`` frames.
         min_area: smallest mover, as a share of the image.
+        room: kept around what moves where it is looked at from nearer by, as a share of its longer side.
+        nearer: enlargement from which on that is worth a pass over the frames (no unit).
         cut_iterations: GrabCut iterations per frame; 0 leaves the seeds.
     """
 
@@ -50,7 +53,34 @@ class MoverParams:
     step: int = 4
     least_motion: float = 0.8
     min_area: float = 0.002
+    room: float = 0.5
+    nearer: float = 1.5
     cut_iterations: int = 2
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What is looked at: rows and columns of every frame, in an image of ``scale`` times their size."""
+
+    rows: slice
+    columns: slice
+    scale: float
+
+    def image(self, frame: Tensor) -> NDArray[np.uint8]:
+        """(h, w, 3) 8-bit RGB."""
+        part = frame[:, self.rows, self.columns]
+        if self.scale < 1.0:
+            size = (max(16, round(part.shape[-2] * self.scale)), max(16, round(part.shape[-1] * self.scale)))
+            part = torch.nn.functional.interpolate(part[None], size=size, mode="area")[0]
+        eight = (part.clamp(0, 1) * 255).round().to(torch.uint8)
+        image: NDArray[np.uint8] = eight.permute(1, 2, 0).contiguous().numpy()
+        return image
+
+    def placed(self) -> NDArray[np.float64]:
+        """Pixels of its image -> pixels of the frame, (3, 3)."""
+        step = 1 / self.scale
+        left, top = self.columns.start + 0.5 * step - 0.5, self.rows.start + 0.5 * step - 0.5
+        return np.array([[step, 0, left], [0, step, top], [0, 0, 1]])
 
 
 @dataclass(eq=False)
@@ -61,15 +91,6 @@ class _Evidence:
     moving: NDArray[np.float64]  # colour histogram of what moves
     resting: NDArray[np.float64]  # colour histogram of all else
     paths: list[NDArray[np.float64]]  # per frame, frame -> first frame
-
-
-def _shrink(frame: Tensor, scale: float) -> NDArray[np.uint8]:
-    """(h, w, 3) 8-bit RGB of the working size."""
-    if scale < 1.0:
-        size = (max(16, round(frame.shape[-2] * scale)), max(16, round(frame.shape[-1] * scale)))
-        frame = torch.nn.functional.interpolate(frame[None], size=size, mode="area")[0]
-    image: NDArray[np.uint8] = (frame.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-    return image
 
 
 def _bin(image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -99,45 +120,54 @@ def _own_motion(
     return moved
 
 
-def _moving_maps(frames: Frames, scale: float, params: MoverParams) -> Iterator[tuple[Any, Any, Any]]:
-    """Per frame: image, how much of it moves (pixels per ``step`` frames), homography to the frame before."""
+def _moving_maps(frames: Frames, whole: _Look, look: _Look, params: MoverParams) -> Iterator[tuple[Any, Any, Any]]:
+    """Per frame: image of the look, how much of it moves (pixels per ``step`` frames), homography to the frame before.
+
+    The background's homographies are fitted in the whole picture, of which a nearer look may show little else than the
+    mover.
+    """
+    to_look = np.linalg.inv(look.placed()) @ whole.placed()
+    from_look = np.linalg.inv(to_look)
     images: list[NDArray[np.uint8]] = []
     grays: list[NDArray[np.uint8]] = []
     links: list[NDArray[np.float64]] = []
     steps: list[NDArray[np.float32]] = []
+
+    def gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return to_gray8(torch.from_numpy(image).permute(2, 0, 1) / 255.0)
 
     def between(first: int, second: int) -> NDArray[np.float32]:
         chain = np.eye(3)
         for link in links[first + 1 : second + 1]:
             chain = np.linalg.inv(link) @ chain
         refined = background_homography(grays[first], grays[second], guess=chain)
-        return _own_motion(grays[first], grays[second], chain if refined is None else refined)
+        carried = to_look @ (chain if refined is None else refined) @ from_look
+        return _own_motion(gray(images[first]), gray(images[second]), carried)
 
     for frame in frames:
-        image = _shrink(frame, scale)
-        gray = to_gray8(torch.from_numpy(image).permute(2, 0, 1) / 255.0)
-        back = background_homography(gray, grays[-1]) if grays else None
-        images.append(image)
-        grays.append(gray)
+        small = gray(whole.image(frame))
+        back = background_homography(small, grays[-1]) if grays else None
+        images.append(look.image(frame))
+        grays.append(small)
         links.append(np.eye(3) if back is None else back)
         if len(images) > params.step:
             ahead = between(0, params.step)
             steps.append(ahead)
-            yield images.pop(0), ahead, links.pop(0)
+            yield images.pop(0), ahead, to_look @ links.pop(0) @ from_look
             grays.pop(0)
     # The last frames have nothing ahead of them; the last map is carried on.
     last = steps[-1] if steps else np.zeros(images[0].shape[:2], np.float32)
     for image, link in zip(images, links, strict=True):
-        yield image, last, link
+        yield image, last, to_look @ link @ from_look
 
 
-def _learn(frames: Frames, scale: float, params: MoverParams) -> _Evidence:
+def _learn(frames: Frames, whole: _Look, look: _Look, params: MoverParams) -> _Evidence:
     heat: NDArray[np.float32] | None = None
     path = np.eye(3)
     paths: list[NDArray[np.float64]] = []
     moving_colours, resting_colours = np.ones(_BINS**3), np.ones(_BINS**3)
     count = 0
-    for image, motion, link in _moving_maps(frames, scale, params):
+    for image, motion, link in _moving_maps(frames, whole, look, params):
         path = path @ link
         path = path / path[2, 2]
         paths.append(path)
@@ -214,17 +244,59 @@ def find_mover(frames: Frames, params: MoverParams = MoverParams()) -> Iterator[
     Raises:
         ReconError: fewer than 8 frames: too few to know what moves.
     """
-    import cv2
-
     if len(frames) < 8:
         raise ReconError(f"frames: {len(frames)} frames are too few to tell a mover from the background; give masks")
     height, width = next(iter(frames)).shape[-2:]
-    scale = min(1.0, params.working_size / max(height, width))
-    known = _learn(frames, scale, params)
+    rows, columns = slice(0, height), slice(0, width)
+    whole = _Look(rows, columns, min(1.0, params.working_size / max(height, width)))
+    known = _learn(frames, whole, whole, params)
+    while whole.scale < 1 and not known.heat.any():
+        whole = replace(whole, scale=min(1.0, 2 * whole.scale))
+        known = _learn(frames, whole, whole, params)
+    look = _nearer(known, whole, params)
+    if look.scale < params.nearer * whole.scale:
+        look = whole
+    else:
+        known = _learn(frames, whole, look, params)
+    for part in _label(frames, whole, look, known, params):
+        mask = torch.zeros(height, width, dtype=torch.bool)
+        mask[look.rows, look.columns] = part
+        yield mask
+
+
+def _nearer(known: _Evidence, whole: _Look, params: MoverParams) -> _Look:
+    """A look at the place of most motion, wherever it drifts, with room; never smaller than the working size."""
+    import cv2
+
+    warm = (known.heat > 0.25 * _typical_heat(known.heat, params)).astype(np.uint8)
+    y, x = np.nonzero(_largest(warm, 1, known.heat))
+    if not len(y):
+        return whole
+    room = params.room * (1 + max(np.ptp(y), np.ptp(x)))
+    (left, right), (top, bottom) = ((v.min() - room, v.max() + 1 + room) for v in (x, y))
+    corners = np.array([[[left, top], [right, top], [left, bottom], [right, bottom]]], np.float64)
+    moved = np.concatenate(
+        [cv2.perspectiveTransform(corners, whole.placed() @ np.linalg.inv(p))[0] for p in known.paths]
+    )
+    centre, half = (moved.max(0) + moved.min(0)) / 2, np.ptp(moved, 0) / 2
+    half = np.maximum(half, params.working_size / 2)
+    size = np.array([whole.columns.stop, whole.rows.stop])
+    low, high = np.floor(centre - half).clip(0).astype(int), np.ceil(centre + half).clip(max=size).astype(int)
+    scale = min(1.0, params.working_size / int((high - low).max()))
+    return _Look(slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])), scale)
+
+
+def _label(
+    frames: Frames, whole: _Look, look: _Look, known: _Evidence, params: MoverParams
+) -> Iterator[Bool[Tensor, "height width"]]:
+    """Masks of the mover, one per frame, in the rows and columns of the look."""
+    import cv2
+
     ratio = np.log(known.moving / known.moving.sum()) - np.log(known.resting / known.resting.sum())
+    size = (look.rows.stop - look.rows.start, look.columns.stop - look.columns.start)
     least = int(params.min_area * known.heat.size)
-    typical = _typical_heat(known.heat, least)
-    for index, (image, motion, _) in enumerate(_moving_maps(frames, scale, params)):
+    typical = _typical_heat(known.heat, params)
+    for index, (image, motion, _) in enumerate(_moving_maps(frames, whole, look, params)):
         back = np.linalg.inv(known.paths[index]).astype(np.float64)
         heat = np.asarray(warp_image(known.heat, back, 0.0), dtype=np.float32)
         likely_colour = cv2.GaussianBlur(ratio[_bin(image)].astype(np.float32), (0, 0), 1.5)
@@ -238,11 +310,12 @@ def find_mover(frames: Frames, params: MoverParams = MoverParams()) -> Iterator[
             sure = cv2.erode(((belief > 2.0) & (chosen > 0)).astype(np.uint8), np.ones((3, 3), np.uint8))
             chosen = _largest(_cut(image, chosen, sure, params.cut_iterations), least, heat + moving)
         mask = torch.from_numpy(chosen.astype(np.float32))[None, None]
-        big = torch.nn.functional.interpolate(mask, size=(height, width), mode="bilinear", align_corners=False)
+        big = torch.nn.functional.interpolate(mask, size=size, mode="bilinear", align_corners=False)
         yield big[0, 0] > 0.5
 
 
-def _typical_heat(heat: NDArray[np.float32], least: int) -> float:
+def _typical_heat(heat: NDArray[np.float32], params: MoverParams) -> float:
     """A third of the heat of the hottest pixels that together make a smallest mover."""
+    least = int(params.min_area * heat.size)
     top = np.sort(heat.ravel())[-max(1, 2 * least) :]
     return float(np.median(top)) / 3.0
