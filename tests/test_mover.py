@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -47,16 +48,15 @@ def test_mover_is_found_before_a_still_and_a_drifting_camera(drift):
     assert sorted(overlap)[len(overlap) // 2] > 0.7
 
 
-def _swaying(height: int, width: int, amplitude: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """A disc of radius 16 that sways on the spot, before a still camera."""
-    wall = _texture(height, width, 5) * torch.tensor([0.5, 0.7, 1.0], dtype=torch.float32)[:, None, None]
-    skin = _texture(height, width, 1) * torch.tensor([1.0, 0.55, 0.4], dtype=torch.float32)[:, None, None]
-    y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+def _small(position: list[float], radius: float, seed: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """A disc at these columns of a picture of 240 x 480, before a still camera."""
+    wall = _texture(240, 480, seed) * torch.tensor([0.5, 0.7, 1.0], dtype=torch.float32)[:, None, None]
+    skin = _texture(240, 480, 1) * torch.tensor([1.0, 0.55, 0.4], dtype=torch.float32)[:, None, None]
+    y, x = torch.meshgrid(torch.arange(240.0), torch.arange(480.0), indexing="ij")
     images, masks = [], []
-    for index in range(26):
-        sway = amplitude * math.sin(2 * math.pi * index / 24)
-        masks.append((x - width / 2 - sway) ** 2 + (y - height / 2) ** 2 < 16.0**2)
-        images.append(torch.where(masks[-1], torch.roll(skin, round(sway), 2), wall))
+    for centre in position:
+        masks.append((x - centre) ** 2 + (y - 120.0) ** 2 < radius**2)
+        images.append(torch.where(masks[-1], torch.roll(skin, round(centre) - 200, 2), wall))
     return images, masks
 
 
@@ -66,15 +66,16 @@ def _overlap(images: list[torch.Tensor], truth: list[torch.Tensor], params: Move
 
 
 def test_motion_too_small_for_the_working_image_is_sought_in_a_larger_one():
-    images, truth = _swaying(240, 330, 6.0)
-    assert _overlap(images, truth, MoverParams(working_size=100)) > 0.8
+    sway = [200.0 + 6.0 * math.sin(2 * math.pi * index / 24) for index in range(26)]
+    images, truth = _small(sway, 16.0, 5)
+    assert _overlap(images, truth, MoverParams(working_size=140)) > 0.8
 
 
 def test_small_mover_is_looked_at_from_nearer_by():
-    # Something is seen to move in the working image now and then; without a nearer look it is lost in most frames.
-    images, truth = _swaying(280, 600, 16.0)
-    assert _overlap(images, truth, MoverParams()) > 0.8
-    assert _overlap(images, truth, MoverParams(nearer=math.inf)) < 0.2
+    images, truth = _small([200.0 + 4.0 * index for index in range(20)], 26.0, 7)
+    params = MoverParams(working_size=120)
+    assert _overlap(images, truth, params) > 0.8
+    assert _overlap(images, truth, replace(params, nearer=math.inf)) < 0.5
 
 
 def test_background_path_follows_the_camera_not_the_mover():
