@@ -55,7 +55,7 @@ class MoverParams:
     min_area: float = 0.002
     room: float = 0.5
     nearer: float = 1.5
-    cut_iterations: int = 2
+    cut_iterations: int = 1
 
 
 @dataclass(frozen=True)
