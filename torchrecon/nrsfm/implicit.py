@@ -16,6 +16,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from torchrecon._typing import Tensor
+from torchrecon.nrsfm.articulation import Articulation
 from torchrecon.nrsfm.quasi_newton import Direction, added, inner, metric, scaled
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, moved, tangents
 
@@ -61,14 +62,20 @@ def _nothing(model: ShapeModel) -> Direction:
     return torch.zeros_like(pose), torch.zeros_like(model.mean), torch.zeros_like(model.loadings)
 
 
+def _objective(views: Views, model: ShapeModel, eps: float, articulation: Articulation | None) -> Tensor:
+    """What the search minimises, per item."""
+    found = evaluate(views, model, eps)
+    return found.value if articulation is None else found.value + articulation.cost(found.points)
+
+
 class _Local:
     """The objective about a model: value, gradient, and products with the Hessian."""
 
-    def __init__(self, views: Views, model: ShapeModel, eps: float) -> None:
+    def __init__(self, views: Views, model: ShapeModel, eps: float, articulation: Articulation | None) -> None:
         with torch.enable_grad():
             pose, mean, loadings = _nothing(model)
             self.at: Direction = pose.requires_grad_(), mean.requires_grad_(), loadings.requires_grad_()
-            self.value = evaluate(views, _stepped(model, self.at), eps).value
+            self.value = _objective(views, _stepped(model, self.at), eps, articulation)
             pose, mean, loadings = torch.autograd.grad(self.value.sum(), self.at, create_graph=True)
             self.gradient: Direction = pose, mean, loadings
 
@@ -154,7 +161,13 @@ def _preconditioner(views: Views, model: ShapeModel, eps: float) -> Callable[[Di
     return metric(model, evaluate(views, model, eps).pose_fisher, residual.expand(len(model.scale)))
 
 
-def settled(views: Views, model: ShapeModel, eps: float, params: ImplicitParams | None = None) -> ShapeModel:
+def settled(
+    views: Views,
+    model: ShapeModel,
+    eps: float,
+    articulation: Articulation | None = None,
+    params: ImplicitParams | None = None,
+) -> ShapeModel:
     """The optimum near a model by Newton's method; ``model`` and the result have one leading batch dimension.
 
     With more unknowns than ``params.dense`` the model is returned as it is, and what :func:`attached` gives is the
@@ -167,7 +180,7 @@ def settled(views: Views, model: ShapeModel, eps: float, params: ImplicitParams 
     with torch.no_grad():
         model = _stepped(model, _nothing(model))
         for _ in range(params.steps):
-            local = _Local(views, model, eps)
+            local = _Local(views, model, eps, articulation)
             pose, mean, loadings = local.gradient
             gradient = pose.detach(), mean.detach(), loadings.detach()
             step = _factorised(local, params.null)(gradient)
@@ -177,7 +190,7 @@ def settled(views: Views, model: ShapeModel, eps: float, params: ImplicitParams 
             for _ in range(params.halvings):
                 trial = _stepped(model, scaled(-length, step))
                 # Where the promise is below the rounding of the value, a full step is right.
-                good = (evaluate(views, trial, eps).value <= local.value) | (promise < 1e-9 * frames)
+                good = (_objective(views, trial, eps, articulation) <= local.value) | (promise < 1e-9 * frames)
                 if bool(good.all()):
                     break
                 length = torch.where(good, length, 0.5 * length)
@@ -201,7 +214,13 @@ class _Follow(torch.autograd.Function):
         return None, *(-part for part in ctx.solve(grad))
 
 
-def attached(views: Views, model: ShapeModel, eps: float, params: ImplicitParams | None = None) -> ShapeModel:
+def attached(
+    views: Views,
+    model: ShapeModel,
+    eps: float,
+    articulation: Articulation | None = None,
+    params: ImplicitParams | None = None,
+) -> ShapeModel:
     """The same optimum with a graph that leads to the tensors of ``views``.
 
     Args:
@@ -210,7 +229,7 @@ def attached(views: Views, model: ShapeModel, eps: float, params: ImplicitParams
     """
     params = params or ImplicitParams()
     fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
-    local = _Local(views, model, eps)
+    local = _Local(views, model, eps, articulation)
     with torch.no_grad():
         solve = _inverse(local, fixed, model, eps, params)
     pose, mean, loadings = _Follow.apply(solve, *local.gradient)

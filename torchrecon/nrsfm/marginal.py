@@ -18,6 +18,7 @@ import torch
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg.noise_edge import difference_noise, marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
+from torchrecon.nrsfm.articulation import ArticulationParams, find_partners
 from torchrecon.nrsfm.base import check_size, solve_items, turn_of_view
 from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
@@ -43,6 +44,7 @@ class MarginalParams:
         descent: of the quasi-Newton descent.
         smoothing: of noisy tracks over time, before anything else.
         spread: of the refits that tell how far the points may be off.
+        articulation: of the pairs of points that keep their distance.
         relief: of the search for a shape of other depth that explains the tracks as well.
         coarse, fine: first and last standard deviation of the residual.
         finest: how far below ``fine`` the residual of exact tracks goes on falling while no new mode appears.
@@ -65,6 +67,7 @@ class MarginalParams:
     descent: DescentParams = field(default_factory=DescentParams)
     smoothing: SmoothingParams = field(default_factory=SmoothingParams)
     spread: SpreadParams = field(default_factory=SpreadParams)
+    articulation: ArticulationParams = field(default_factory=ArticulationParams)
     relief: ReliefParams = field(default_factory=ReliefParams)
     coarse: float = 0.1
     fine: float = 0.003
@@ -149,20 +152,26 @@ def solve_marginal(
         # Tracks that show more than one basis have modes: only a body that may be rigid has to prove them.
         draws = 1.0 if views is measured or rank > 1 else float(fixed.noise.mean() / measured.noise.mean())
         model, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
+        rigid = None
+        if model.loadings.shape[-1]:
+            noise = float(fixed.noise.diagonal(dim1=-2, dim2=-1).mean())
+            rigid = find_partners(evaluate(fixed, model, eps).points[0], noise, params.articulation)
+        if rigid is not None:
+            model, _, _ = descend(fixed, model, eps, params.articulation.steps, params.descent, rigid)
         if asked:
-            model = settled(fixed, model, eps)
+            model = settled(fixed, model, eps, rigid)
     if asked:
-        model = attached(views, model, eps)
+        model = attached(views, model, eps, rigid)
     answer = evaluate(views, model, eps, with_spread=True)
     assert answer.spread is not None
     covariance = posterior_covariance(views, model, answer, eps)
     # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
     if params.spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
         smooth = partial(smoothed, params=params.smoothing)
-        errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)
+        errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent, rigid)
         covariance = widened(covariance, errors, params.spread.window)
     if params.spread.halves:
-        errors = halved(fixed, model, answer, eps, generator, params.spread, params.descent)
+        errors = halved(fixed, model, answer, eps, generator, params.spread, params.descent, rigid)
         covariance = widened(covariance, errors, params.spread.window)
     doubt = None
     turn = float(turn_of_view(model.rotations[0].detach()))

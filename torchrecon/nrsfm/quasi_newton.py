@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from torchrecon._typing import Tensor
+from torchrecon.nrsfm.articulation import Articulation, evaluate_with
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, moved
 
 __all__ = ["DescentParams", "Direction", "added", "descend", "inner", "metric", "scaled"]
@@ -87,16 +88,30 @@ def metric(model: ShapeModel, fisher: Tensor, residual: Tensor) -> Callable[[Dir
 
 
 def descend(
-    views: Views, model: ShapeModel, eps: float, steps: int, params: DescentParams
+    views: Views,
+    model: ShapeModel,
+    eps: float,
+    steps: int,
+    params: DescentParams,
+    articulation: Articulation | None = None,
 ) -> tuple[ShapeModel, Tensor, bool]:
     """At most ``steps`` steps from a model with one leading batch dimension.
+
+    Args:
+        articulation: what rigid pairs add to the value, if anything.
 
     Returns:
         model; the value per item (b,); whether every item converged before the steps were spent.
     """
+
+    def judged(model: ShapeModel) -> Evaluation:
+        if articulation is None:
+            return evaluate(views, model, eps)
+        return evaluate_with(articulation, views, model, eps)
+
     frames = model.scale.shape[-1]
     residual = (views.noise.diagonal(dim1=-2, dim2=-1).mean((-1, -2, -3)) + eps**2).expand(len(model.scale))
-    now = evaluate(views, model, eps)
+    now = judged(model)
     pairs: list[tuple[Direction, Direction, Tensor]] = []
     done = torch.zeros_like(now.value, dtype=torch.bool)
     for _ in range(steps):
@@ -122,7 +137,7 @@ def descend(
         for _ in range(params.halvings):
             step = scaled(-length, q)
             trial = moved(model, *step)
-            then = evaluate(views, trial, eps)
+            then = judged(trial)
             good = (then.value <= now.value + params.sufficient * length * slope) | (length == 0)
             if bool(good.all()):
                 break
@@ -131,7 +146,7 @@ def descend(
         if not bool(good.all()):
             step = scaled(-length, q)
             trial = moved(model, *step)
-            then = evaluate(views, trial, eps)
+            then = judged(trial)
         change = added(_gradient(then), -torch.ones_like(length), _gradient(now))
         curvature = inner(step, change)
         usable = curvature > 1e-10 * (length * slope).abs()

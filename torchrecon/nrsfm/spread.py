@@ -20,6 +20,7 @@ import torch
 
 from torchrecon._typing import Float, Tensor
 from torchrecon.linalg import skew
+from torchrecon.nrsfm.articulation import Articulation
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate
 
@@ -43,7 +44,7 @@ class SpreadParams:
     draws: int = 4
     steps: int = 15
     halves: int = 2
-    half_steps: int = 40
+    half_steps: int = 20
     stretches: int = 6
     least: int = 8
     window: int = 4
@@ -75,13 +76,20 @@ def posterior_covariance(
 
 
 def _errors(
-    fitted: Views, shown: Views, model: ShapeModel, answer: Evaluation, eps: float, steps: int, descent: DescentParams
+    fitted: Views,
+    shown: Views,
+    model: ShapeModel,
+    answer: Evaluation,
+    eps: float,
+    steps: int,
+    descent: DescentParams,
+    articulation: Articulation | None,
 ) -> Float[Tensor, "refits frames points 3"]:
     """How far fits to each of ``fitted``, begun at the model, move the points that they say of ``shown``; centred."""
     count = len(fitted.xy)
     parts = (getattr(model, part.name) for part in fields(ShapeModel))
     start = ShapeModel(*(part.expand(count, *[-1] * (part.ndim - 1)).clone() for part in parts))
-    again, _, _ = descend(fitted, start, eps, steps, descent)
+    again, _, _ = descend(fitted, start, eps, steps, descent, articulation)
     away = evaluate(shown, again, eps).points - answer.points
     return away - away.mean(-2, keepdim=True)
 
@@ -96,6 +104,7 @@ def refitted(
     generator: torch.Generator,
     params: SpreadParams,
     descent: DescentParams,
+    articulation: Articulation | None = None,
 ) -> Float[Tensor, "draws frames points 3"]:
     """Errors of refits to what the answer predicts with fresh noise; centred per frame, camera axes.
 
@@ -117,7 +126,7 @@ def refitted(
         noisy = predicted + torch.where(seen, noise, noise.new_zeros(()))
         drawn.append(smooth(Views(noisy, measured.visible, measured.noise), noisy))
     views = Views(*(torch.stack([getattr(view, part.name) for view in drawn]) for part in fields(Views)))
-    return _errors(views, views, model, answer, eps, params.steps, descent)
+    return _errors(views, views, model, answer, eps, params.steps, descent, articulation)
 
 
 @torch.no_grad()
@@ -129,6 +138,7 @@ def halved(
     generator: torch.Generator,
     params: SpreadParams,
     descent: DescentParams,
+    articulation: Articulation | None = None,
 ) -> Float[Tensor, "halves frames points 3"]:
     """Errors of fits to one half of the tracks; centred per frame, camera axes.
 
@@ -146,7 +156,7 @@ def halved(
     kept = views.visible & ((time + begin) // length % 2 == 0)
     kept = torch.where(kept.sum(-1, keepdim=True) < params.least, views.visible, kept)
     some = Views(views.xy.expand(params.halves, -1, -1, -1), kept, views.noise.expand(params.halves, -1, -1, -1, -1))
-    return _errors(some, views, model, answer, eps, params.half_steps, descent)
+    return _errors(some, views, model, answer, eps, params.half_steps, descent, articulation)
 
 
 def _average(values: Float[Tensor, "frames kinds"], half: int) -> Float[Tensor, "frames kinds"]:
