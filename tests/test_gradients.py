@@ -46,6 +46,29 @@ def test_gradient_of_the_default_solver_is_that_of_whole_solves(empty):
     assert float((by_noise * grow).sum().abs()) > 1e-2 * abs(slope)  # both have their say
 
 
+def test_gradient_holds_where_pairs_keep_their_distance():
+    # Two rigid halves on a hinge: the pairs are found, so the optimum is that with their term.
+    g = torch.Generator().manual_seed(3)
+    time = torch.linspace(0, 3, 10, dtype=torch.float64)
+    rest = torch.randn(16, 3, generator=g, dtype=torch.float64)
+    hinge = rotation_from_vector(0.5 * torch.sin(2 * time + 1)[:, None] * torch.tensor([1.0, 0.0, 0.0]).double())
+    shape = 100 * torch.cat([rest[:8].expand(10, 8, 3), rest[8:] @ hinge.mT], 1)
+    turn = rotation_from_vector(time[:, None] * torch.tensor([0.3, 1.0, 0.1], dtype=torch.float64))
+    truth = (shape - shape.mean(1, keepdim=True)) @ turn.mT
+    xy = (truth[..., :2] + 0.3 * torch.randn(10, 16, 2, generator=g, dtype=torch.float64)).requires_grad_()
+    noise = 0.1 * torch.eye(2, dtype=torch.float64).repeat(10, 16, 1, 1)
+    weight = torch.randn(truth.shape, generator=g, dtype=torch.float64)
+
+    def score(xy: torch.Tensor) -> torch.Tensor:
+        return (tr.reconstruct(tr.Tracks(xy, covariance=noise), 2).points3d * weight).sum()
+
+    step = torch.randn(xy.shape, generator=g, dtype=torch.float64)
+    slope = float((torch.autograd.grad(score(xy), xy)[0] * step).sum())
+    h = 1e-3
+    there = float((score(xy + h * step) - score(xy - h * step)).detach())
+    assert slope == pytest.approx(there / (2 * h), rel=1e-3)
+
+
 def test_iterated_and_factorised_hessian_give_one_gradient():
     g = torch.Generator().manual_seed(2)
     truth = bending(10, 7) / 100

@@ -165,8 +165,8 @@ def settled(
     views: Views,
     model: ShapeModel,
     eps: float,
-    articulation: Articulation | None = None,
     params: ImplicitParams | None = None,
+    articulation: Articulation | None = None,
 ) -> ShapeModel:
     """The optimum near a model by Newton's method; ``model`` and the result have one leading batch dimension.
 
@@ -218,8 +218,8 @@ def attached(
     views: Views,
     model: ShapeModel,
     eps: float,
-    articulation: Articulation | None = None,
     params: ImplicitParams | None = None,
+    articulation: Articulation | None = None,
 ) -> ShapeModel:
     """The same optimum with a graph that leads to the tensors of ``views``.
 

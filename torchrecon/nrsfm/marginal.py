@@ -159,19 +159,19 @@ def solve_marginal(
         if rigid is not None:
             model, _, _ = descend(fixed, model, eps, params.articulation.steps, params.descent, rigid)
         if asked:
-            model = settled(fixed, model, eps, rigid)
+            model = settled(fixed, model, eps, articulation=rigid)
     if asked:
-        model = attached(views, model, eps, rigid)
+        model = attached(views, model, eps, articulation=rigid)
     answer = evaluate(views, model, eps, with_spread=True)
     assert answer.spread is not None
     covariance = posterior_covariance(views, model, answer, eps)
     # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
     if params.spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
         smooth = partial(smoothed, params=params.smoothing)
-        errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent, rigid)
+        errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)
         covariance = widened(covariance, errors, params.spread.window)
     if params.spread.halves:
-        errors = halved(fixed, model, answer, eps, generator, params.spread, params.descent, rigid)
+        errors = halved(fixed, model, answer, eps, generator, params.spread, params.descent)
         covariance = widened(covariance, errors, params.spread.window)
     doubt = None
     turn = float(turn_of_view(model.rotations[0].detach()))

@@ -20,7 +20,6 @@ import torch
 
 from torchrecon._typing import Float, Tensor
 from torchrecon.linalg import skew
-from torchrecon.nrsfm.articulation import Articulation
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate
 
@@ -44,7 +43,7 @@ class SpreadParams:
     draws: int = 4
     steps: int = 15
     halves: int = 2
-    half_steps: int = 20
+    half_steps: int = 40
     stretches: int = 6
     least: int = 8
     window: int = 4
@@ -76,20 +75,13 @@ def posterior_covariance(
 
 
 def _errors(
-    fitted: Views,
-    shown: Views,
-    model: ShapeModel,
-    answer: Evaluation,
-    eps: float,
-    steps: int,
-    descent: DescentParams,
-    articulation: Articulation | None,
+    fitted: Views, shown: Views, model: ShapeModel, answer: Evaluation, eps: float, steps: int, descent: DescentParams
 ) -> Float[Tensor, "refits frames points 3"]:
     """How far fits to each of ``fitted``, begun at the model, move the points that they say of ``shown``; centred."""
     count = len(fitted.xy)
     parts = (getattr(model, part.name) for part in fields(ShapeModel))
     start = ShapeModel(*(part.expand(count, *[-1] * (part.ndim - 1)).clone() for part in parts))
-    again, _, _ = descend(fitted, start, eps, steps, descent, articulation)
+    again, _, _ = descend(fitted, start, eps, steps, descent)
     away = evaluate(shown, again, eps).points - answer.points
     return away - away.mean(-2, keepdim=True)
 
@@ -104,7 +96,6 @@ def refitted(
     generator: torch.Generator,
     params: SpreadParams,
     descent: DescentParams,
-    articulation: Articulation | None = None,
 ) -> Float[Tensor, "draws frames points 3"]:
     """Errors of refits to what the answer predicts with fresh noise; centred per frame, camera axes.
 
@@ -126,7 +117,7 @@ def refitted(
         noisy = predicted + torch.where(seen, noise, noise.new_zeros(()))
         drawn.append(smooth(Views(noisy, measured.visible, measured.noise), noisy))
     views = Views(*(torch.stack([getattr(view, part.name) for view in drawn]) for part in fields(Views)))
-    return _errors(views, views, model, answer, eps, params.steps, descent, articulation)
+    return _errors(views, views, model, answer, eps, params.steps, descent)
 
 
 @torch.no_grad()
@@ -138,7 +129,6 @@ def halved(
     generator: torch.Generator,
     params: SpreadParams,
     descent: DescentParams,
-    articulation: Articulation | None = None,
 ) -> Float[Tensor, "halves frames points 3"]:
     """Errors of fits to one half of the tracks; centred per frame, camera axes.
 
@@ -156,7 +146,7 @@ def halved(
     kept = views.visible & ((time + begin) // length % 2 == 0)
     kept = torch.where(kept.sum(-1, keepdim=True) < params.least, views.visible, kept)
     some = Views(views.xy.expand(params.halves, -1, -1, -1), kept, views.noise.expand(params.halves, -1, -1, -1, -1))
-    return _errors(some, views, model, answer, eps, params.half_steps, descent, articulation)
+    return _errors(some, views, model, answer, eps, params.half_steps, descent)
 
 
 def _average(values: Float[Tensor, "frames kinds"], half: int) -> Float[Tensor, "frames kinds"]:
