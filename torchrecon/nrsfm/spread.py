@@ -7,6 +7,7 @@ a parametric bootstrap (Efron 1979), in which noise is drawn again about the tra
 draw is smoothed and fitted; and fits to one half of the tracks (delete-half jackknife, Shao and Wu 1989), which show
 what exact tracks leave open too: a likelihood as flat as that of bending bodies hardly tells the answer from its
 neighbours, and deformation that the model lacks pulls the halves apart.
+Both follow the likelihood alone, without the term for articulation: they show what the tracks leave open.
 A few refits do not give a covariance per point, but they tell well by how much the closed form is too small: per axis
 of the whitened errors, per frame and per point. No refit leaves the basin of the answer.
 """
