@@ -3,8 +3,8 @@
 A first pass compares frames a few steps apart by dense optical flow, takes out the motion of the background (a
 homography), and collects where in the picture something moves on its own and which colours it has there. Where nothing
 does, a picture twice as large is looked at; where what moves is a small part of the picture, as a player filmed with
-the whole court, it is looked at again from nearer by. The last pass labels every frame by a graph cut (GrabCut) seeded with
-what moves now and with what those two maps say, so that parts of the body that rest for a while are still found.
+the whole court, it is looked at again from nearer by. The last pass labels every frame by a graph cut (GrabCut) seeded
+with what moves now and with what those two maps say, so that parts of the body that rest for a while are still found.
 """
 
 from __future__ import annotations
