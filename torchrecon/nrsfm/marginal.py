@@ -10,7 +10,7 @@ The model is in ``shape_likelihood``; the search is derived here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -18,11 +18,12 @@ import torch
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg.noise_edge import difference_noise, marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
-from torchrecon.nrsfm.articulation import ArticulationParams, find_partners
+from torchrecon.nrsfm.articulation import Articulation, ArticulationParams, find_partners
 from torchrecon.nrsfm.base import check_size, solve_items, turn_of_view
 from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
+from torchrecon.nrsfm.hopping import Growth, HoppingParams, better_basin
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
@@ -45,6 +46,7 @@ class MarginalParams:
         smoothing: of noisy tracks over time, before anything else.
         spread: of the refits that tell how far the points may be off.
         articulation: of the pairs of points that keep their distance.
+        hopping: of the search for a basin in which more of them do.
         relief: of the search for a shape of other depth that explains the tracks as well.
         coarse, fine: first and last standard deviation of the residual.
         finest: how far below ``fine`` the residual of exact tracks goes on falling while no new mode appears.
@@ -68,6 +70,7 @@ class MarginalParams:
     smoothing: SmoothingParams = field(default_factory=SmoothingParams)
     spread: SpreadParams = field(default_factory=SpreadParams)
     articulation: ArticulationParams = field(default_factory=ArticulationParams)
+    hopping: HoppingParams = field(default_factory=HoppingParams)
     relief: ReliefParams = field(default_factory=ReliefParams)
     coarse: float = 0.1
     fine: float = 0.003
@@ -152,12 +155,7 @@ def solve_marginal(
         # Tracks that show more than one basis have modes: only a body that may be rigid has to prove them.
         draws = 1.0 if views is measured or rank > 1 else float(fixed.noise.mean() / measured.noise.mean())
         model, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
-        rigid = None
-        if model.loadings.shape[-1]:
-            noise = float(fixed.noise.diagonal(dim1=-2, dim2=-1).mean())
-            rigid = find_partners(evaluate(fixed, model, eps).points[0], noise, params.articulation)
-        if rigid is not None:
-            model, _, _ = descend(fixed, model, eps, params.articulation.steps, params.descent, rigid)
+        model, eps, rigid = _articulated(fixed, model, eps, draws, generator, params)
         if asked:
             model = settled(fixed, model, eps, articulation=rigid)
     if asked:
@@ -202,6 +200,40 @@ def solve_marginal(
         covariance3d=covariance,
     )
     return answered.to(dtype=dtype)
+
+
+def _articulated(
+    views: Views, model: ShapeModel, eps: float, draws: float, generator: torch.Generator, params: MarginalParams
+) -> tuple[ShapeModel, float, Articulation | None]:
+    """The answer, its residual and the pairs that keep their distance; as it was where there are none.
+
+    An exact family, whose residual went on falling, is left where it is unless it breaks its pairs.
+    """
+    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+    strict = replace(params.articulation, loosest=params.articulation.deviation)
+
+    def unmet(model: ShapeModel, eps: float) -> float:
+        points = evaluate(views, model, eps).points[0]
+        rigid = find_partners(points, noise, strict)
+        return 1.0 if rigid is None else float(rigid.unmet(points))
+
+    if not model.loadings.shape[-1]:
+        return model, eps, None
+    found, level = model, max(eps, params.fine)
+    if eps >= level or unmet(model, eps) > params.articulation.believed:
+        growth = Growth(params.modes, _told_noise(views, params), draws, params.growths, params.steps)
+        found = better_basin(
+            views, model, level, growth, generator, params.hopping, params.articulation, params.descent
+        )
+    else:
+        level = eps
+    rigid = find_partners(evaluate(views, found, level).points[0], noise, params.articulation)
+    if rigid is None:
+        return model, eps, None
+    found, _, _ = descend(views, found, level, params.articulation.steps, params.descent, rigid)
+    if unmet(found, level) > params.articulation.believed:
+        return model, eps, None
+    return found, level, rigid
 
 
 def _told_noise(views: Views, params: MarginalParams) -> float:

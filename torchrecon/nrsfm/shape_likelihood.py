@@ -142,6 +142,20 @@ def _spread(placed: Tensor, factor: Tensor, gain: Tensor) -> Tensor:
     return (kept.flatten(-3, -2) @ root[..., : kept.shape[-1], :]).unflatten(-2, kept.shape[-3:-1])
 
 
+def _whitened(whitener: Tensor, rows: Float[Tensor, "*b points 2 columns"]) -> Float[Tensor, "*b points 2 columns"]:
+    """``whitener @ rows`` for lower triangles, without a matrix product for every point."""
+    first, second = rows.unbind(-2)
+    k = whitener[..., None]
+    return torch.stack([k[..., 0, 0, :] * first, k[..., 1, 0, :] * first + k[..., 1, 1, :] * second], -2)
+
+
+def _back(whitener: Tensor, rows: Float[Tensor, "*b points 2 columns"]) -> Float[Tensor, "*b points 2 columns"]:
+    """``whitener.mT @ rows`` likewise."""
+    first, second = rows.unbind(-2)
+    k = whitener[..., None]
+    return torch.stack([k[..., 0, 0, :] * first + k[..., 1, 0, :] * second, k[..., 1, 1, :] * second], -2)
+
+
 def evaluate(views: Views, model: ShapeModel, eps: float, *, with_spread: bool = False) -> Evaluation:
     """Minus the log-likelihood with its gradient, see the module's text; ``eps`` is the deviation of the residual."""
     modes = model.loadings.shape[-1]
@@ -152,8 +166,8 @@ def evaluate(views: Views, model: ShapeModel, eps: float, *, with_spread: bool =
     seen = views.visible[..., None]
     error = torch.where(seen, views.xy - plane[..., 0], plane.new_zeros(()))
     # Columns: the modes, then the two of the translation, whose prior is flat.
-    design = torch.cat([whitener @ plane[..., 1:], whitener], -1).flatten(-3, -2)
-    target = (whitener @ error[..., None]).flatten(-3, -2)
+    design = torch.cat([_whitened(whitener, plane[..., 1:]), whitener], -1).flatten(-3, -2)
+    target = _whitened(whitener, error[..., None]).flatten(-3, -2)
     precision = torch.cat([plane.new_ones(modes), plane.new_full((2,), 1e-9)])
     factor = torch.linalg.cholesky(design.mT @ design + torch.diag(precision))
     weights = torch.cholesky_solve(design.mT @ target, factor)
@@ -163,19 +177,19 @@ def evaluate(views: Views, model: ShapeModel, eps: float, *, with_spread: bool =
     value = (0.5 * (target * rest).sum((-1, -2)) + half - scatter).sum(-1)
 
     # Gradient with respect to everything placed in the image.
-    solved = torch.cholesky_solve(design.mT, factor).mT[..., :modes]
-    inner = torch.cat([-rest, solved - rest @ weights[..., :modes, :].mT], -1)
-    slope = whitener.mT @ inner.unflatten(-2, (plane.shape[-3], 2))
+    inverse = torch.cholesky_inverse(factor)
+    solved = design @ inverse
+    inner = torch.cat([-rest, solved[..., :modes] - rest @ weights[..., :modes, :].mT], -1)
+    slope = _back(whitener, inner.unflatten(-2, (plane.shape[-3], 2)))
     stacked = slope.transpose(-3, -2).flatten(-2)  # (*b, frames, 2, points * (1 + modes))
     poses = model.scale[..., None, None] * model.rotations[..., :2, :]
     basis = (poses.flatten(-3, -2).mT @ stacked.flatten(-3, -2)).unflatten(-1, (plane.shape[-3], 1 + modes))
     basis = basis.transpose(-3, -2)
-    x, y, z = placed.flatten(-2).unbind(-2)
-    gx, gy = stacked.unbind(-2)
-    pose = torch.stack([-(gy * z).sum(-1), (gx * z).sum(-1), (gy * x - gx * y).sum(-1), (gx * x + gy * y).sum(-1)], -1)
+    gx, gy = (stacked @ placed.flatten(-2).mT).unbind(-2)
+    pose = torch.stack([-gy[..., 2], gx[..., 2], gy[..., 0] - gx[..., 1], gx[..., 0] + gy[..., 1]], -1)
     # The residual grows with the scale: s^2 eps^2 (tr C^-1 - |C^-1 e|^2), with C^-1 = K^T (I - design G^-1 design^T) K.
-    within = whitener.mT @ design.unflatten(-2, (plane.shape[-3], 2))
-    known = torch.linalg.solve_triangular(factor, within.flatten(-3, -2).mT, upper=False).square().sum((-1, -2))
+    within = _back(whitener, design.unflatten(-2, (plane.shape[-3], 2))).flatten(-3, -2)
+    known = (_back(whitener, solved.unflatten(-2, (plane.shape[-3], 2))).flatten(-3, -2) * within).sum((-1, -2))
     pull = slope[..., 0].square().sum((-1, -2))
     pose[..., 3] += residual * (whitener.square().sum((-1, -2, -3)) - known - pull)
     pose[..., 3] -= pose[..., 3].mean(-1, keepdim=True)
@@ -184,16 +198,16 @@ def evaluate(views: Views, model: ShapeModel, eps: float, *, with_spread: bool =
     loadings = (flat - model.avoided @ (model.avoided.mT @ flat)).view_as(loadings)
 
     # Posterior of the shapes, and the information of the poses at its mean.
-    average = torch.cat([torch.ones_like(weights[..., :1, 0]), weights[..., :modes, 0]], -1)
-    fitted = torch.einsum("...cpk,...k->...pc", placed, average)
+    shapes = (weights[..., :modes, 0] @ model.loadings.flatten(-3, -2).mT).unflatten(-1, model.mean.shape[-2:])
+    fitted = (model.mean[..., None, :, :] + shapes) @ (model.scale[..., None, None] * model.rotations).mT
     translation = weights[..., modes:, 0]
-    gain = residual[..., None, None, None] * (whitener.mT @ whitener)
+    gain = residual[..., None, None, None] * _back(whitener, whitener)
     loose = error - (fitted[..., :2] - plane[..., 0]) - translation[..., None, :]
     inplane = fitted[..., :2] + (gain @ torch.where(seen, loose, loose.new_zeros(()))[..., None])[..., 0]
     points = torch.cat([inplane, fitted[..., 2:]], -1)
     spread = _spread(placed, factor, gain) if with_spread else None
     jacobian = torch.cat([-skew(points)[..., :2, :], points[..., :2, None]], -1)
-    seen_jacobian = (whitener @ jacobian).flatten(-3, -2)
+    seen_jacobian = _whitened(whitener, jacobian).flatten(-3, -2)
     explained = torch.linalg.solve_triangular(factor, design.mT @ seen_jacobian, upper=False)
     fisher = seen_jacobian.mT @ seen_jacobian - explained.mT @ explained
     return Evaluation(value, pose, mean - mean.mean(-2, keepdim=True), loadings, fisher, points, spread, translation)

@@ -1,0 +1,200 @@
+"""Search for a likelier basin, once parts that keep their distances can tell basins apart.
+
+Low rank alone ends in one of many answers that explain the tracks about as well. With the term for articulation they
+differ, but a descent at the last residual does not leave its basin: the residual and the width of the term have to
+start wide and fall together. So the search is repeated from the best answer so far, as it is, made shallower or deeper
+along the view, and with turns that are off by a little, and the likeliest is kept: basin hopping (Wales and Doye 1997),
+with moves derived here. It goes over a part of the frames; the winner is then brought to all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from torchrecon._typing import Int, Tensor
+from torchrecon.linalg import interpolated, nearest_rotation, rotation_angle, rotation_from_vector
+from torchrecon.nrsfm.articulation import ArticulationParams, find_partners
+from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.relief import made_deeper
+from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings
+
+__all__ = ["Growth", "HoppingParams", "better_basin"]
+
+
+@dataclass(frozen=True)
+class HoppingParams:
+    """Parameters of the search; lengths are in units of the rms size of the tracks.
+
+    Attributes:
+        hops: moves that are tried at most (count).
+        patience: moves in a row that bring nothing after which it ends (count).
+        frames: that it goes over at least, evenly spaced (count).
+        turn: between two of these at most (degrees).
+        coarse: first standard deviation of the residual.
+        resumed: the same where the winner is brought to all frames.
+        levels: of the residual, geometric down to that of the answer (count).
+        width: deviation of a rigid pair over that of the residual, as long as this is above its last value (no unit).
+        last_rounds: of growth and descent on the last level; the others have one (count).
+        factor: by which a move makes the body shallower or deeper (no unit).
+        wobble: standard deviation of the turns that a move adds (radians).
+        knots: frames between two of these turns, straight lines in between (count).
+        deepest: depth over image size, both rms over points and frames, beyond which an answer is none: distances of
+            an infinitely deep body are constant whatever is seen (no unit).
+    """
+
+    hops: int = 12
+    patience: int = 4
+    frames: int = 60
+    turn: float = 30.0
+    coarse: float = 0.1
+    resumed: float = 0.03
+    levels: int = 8
+    width: float = 3.0
+    last_rounds: int = 3
+    factor: float = 1.4
+    wobble: float = 0.15
+    knots: int = 12
+    deepest: float = 2.0
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How modes come in, see ``grow_loadings``, and how the descent goes on between.
+
+    Attributes:
+        modes, noise, draws: as for ``grow_loadings``.
+        growths: steps of expectation-maximisation before a descent (count).
+        steps: quasi-Newton steps of a descent (count).
+    """
+
+    modes: int
+    noise: float
+    draws: float
+    growths: int
+    steps: int
+
+
+def _annealed(
+    views: Views,
+    model: ShapeModel,
+    eps: float,
+    coarse: float,
+    growth: Growth,
+    params: HoppingParams,
+    articulation: ArticulationParams,
+    descent: DescentParams,
+) -> tuple[ShapeModel, float]:
+    """The model where residual and width of the term have fallen together, and what it costs there, see ``_cost``."""
+    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+    fall = (eps / coarse) ** (1 / (params.levels - 1))
+    for level in range(params.levels):
+        residual = coarse * fall**level
+        wide = replace(articulation, deviation=max(articulation.deviation, params.width * residual))
+        for _ in range(params.last_rounds if level == params.levels - 1 else 1):
+            for _ in range(growth.growths):
+                model = grow_loadings(views, model, residual, growth.modes, growth.noise, growth.draws)
+            rigid = find_partners(evaluate(views, model, residual).points[0], noise, wide)
+            model, _, _ = descend(views, model, residual, growth.steps, descent, rigid)
+    return model, _cost(views, model, eps, params, articulation)
+
+
+def _cost(
+    views: Views, model: ShapeModel, eps: float, params: HoppingParams, articulation: ArticulationParams
+) -> float:
+    """Likelihood and term at the last residual, nats a frame.
+
+    Infinite where it is no answer: deeper than a body can be, or one that keeps too few distances.
+    """
+    answer = evaluate(views, model, eps)
+    if float(answer.points[..., 2].norm()) > params.deepest * float(answer.points[..., :2].norm()):
+        return torch.inf
+    alike = replace(articulation, loosest=articulation.deviation)  # one width for all answers, or costs do not compare
+    rigid = find_partners(answer.points[0], float(views.noise.diagonal(dim1=-2, dim2=-1).mean()), alike)
+    if rigid is None or float(rigid.unmet(answer.points)) > articulation.believed:
+        return torch.inf
+    return (float(answer.value) + float(rigid.cost(answer.points))) / model.scale.shape[-1]
+
+
+def _survey_frames(model: ShapeModel, params: HoppingParams) -> Int[Tensor, " chosen"]:
+    """Evenly spaced frames, close enough for the turns of the model."""
+    frames = model.scale.shape[-1]
+    step = max(1, frames // params.frames)
+    while step > 1:
+        chosen = model.rotations[0, ::step]
+        if float(rotation_angle(chosen[1:] @ chosen[:-1].mT).max()) <= torch.pi / 180 * params.turn:
+            break
+        step -= 1
+    return torch.arange(0, frames, step, device=model.scale.device)
+
+
+def _part(views: Views, model: ShapeModel, index: Tensor) -> tuple[Views, ShapeModel]:
+    """Some frames of observations and model."""
+    scale = model.scale[:, index]
+    scale = scale / scale.log().mean().exp()
+    some = Views(views.xy[index], views.visible[index], views.noise[index])
+    return some, replace(model, rotations=model.rotations[:, index], scale=scale)
+
+
+def _whole(part: ShapeModel, index: Tensor, frames: int) -> ShapeModel:
+    """A model of all frames from one of some: poses in between are interpolated."""
+    there = torch.zeros(frames, dtype=torch.bool, device=index.device)
+    there[index] = True
+
+    def spread(values: Tensor) -> Tensor:
+        return interpolated(values.new_zeros(frames, *values.shape[1:]).index_copy(0, index, values), there)[None]
+
+    scale = spread(part.scale[0].log())
+    return replace(part, rotations=nearest_rotation(spread(part.rotations[0])), scale=(scale - scale.mean()).exp())
+
+
+def _wobbled(model: ShapeModel, params: HoppingParams, generator: torch.Generator) -> ShapeModel:
+    """The model with smooth random turns added."""
+    frames = model.scale.shape[-1]
+    knots = torch.randn(1, 3, max(2, frames // params.knots), generator=generator, dtype=torch.float64)
+    turns = torch.nn.functional.interpolate(knots, size=frames, mode="linear", align_corners=True)[0].mT
+    return replace(model, rotations=rotation_from_vector(params.wobble * turns.to(model.scale)) @ model.rotations)
+
+
+@torch.no_grad()
+def better_basin(
+    views: Views,
+    model: ShapeModel,
+    eps: float,
+    growth: Growth,
+    generator: torch.Generator,
+    params: HoppingParams,
+    articulation: ArticulationParams,
+    descent: DescentParams,
+) -> ShapeModel:
+    """The likeliest of the model and what hops from it lead to; likelihood and term for articulation together.
+
+    The first hop, from the model as it is, ends the search where it shows no parts that keep their distances.
+
+    Args:
+        model: a batch of one, with modes.
+        eps: standard deviation of its residual.
+    """
+    index = _survey_frames(model, params)
+    some, best = _part(views, model, index)
+    moves = (
+        lambda start: start,
+        lambda start: made_deeper(start, 1 / params.factor),
+        lambda start: made_deeper(start, params.factor),
+        lambda start: _wobbled(start, params, generator),
+    )
+    least, vain = torch.inf, 0
+    for hop in range(params.hops):
+        start = moves[hop % len(moves)](best)
+        found, cost = _annealed(some, start, eps, params.coarse, growth, params, articulation, descent)
+        vain = 0 if cost < least else vain + 1
+        if cost < least:
+            best, least = found, cost
+        if least == torch.inf or vain == params.patience:
+            break
+    if least == torch.inf:
+        return model
+    whole = _whole(best, index, model.scale.shape[-1])
+    whole, cost = _annealed(views, whole, eps, params.resumed, growth, params, articulation, descent)
+    return whole if cost < _cost(views, model, eps, params, articulation) else model
