@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from torchrecon._typing import Int, Tensor
+from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import interpolated, nearest_rotation, rotation_angle, rotation_from_vector
 from torchrecon.nrsfm.articulation import ArticulationParams, find_partners
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
@@ -95,9 +95,16 @@ def _annealed(
         for _ in range(params.last_rounds if level == params.levels - 1 else 1):
             for _ in range(growth.growths):
                 model = grow_loadings(views, model, residual, growth.modes, growth.noise, growth.draws)
-            rigid = find_partners(evaluate(views, model, residual).points[0], noise, wide)
-            model, _, _ = descend(views, model, residual, growth.steps, descent, rigid)
+            points = evaluate(views, model, residual).points[0]
+            if not _plausible(points, params):
+                return model, torch.inf
+            model, _, _ = descend(views, model, residual, growth.steps, descent, find_partners(points, noise, wide))
     return model, _cost(views, model, eps, params, articulation)
+
+
+def _plausible(points: Float[Tensor, "frames points 3"], params: HoppingParams) -> bool:
+    """Whether a body is no deeper than bodies are; false for numbers that are none."""
+    return float(points[..., 2].norm()) <= params.deepest * float(points[..., :2].norm())
 
 
 def _cost(
@@ -105,10 +112,10 @@ def _cost(
 ) -> float:
     """Likelihood and term at the last residual, nats a frame.
 
-    Infinite where it is no answer: deeper than a body can be, or one that keeps too few distances.
+    Infinite where it is no answer: deeper than bodies are, or one that keeps too few distances.
     """
     answer = evaluate(views, model, eps)
-    if float(answer.points[..., 2].norm()) > params.deepest * float(answer.points[..., :2].norm()):
+    if not _plausible(answer.points[0], params):
         return torch.inf
     alike = replace(articulation, loosest=articulation.deviation)  # one width for all answers, or costs do not compare
     rigid = find_partners(answer.points[0], float(views.noise.diagonal(dim1=-2, dim2=-1).mean()), alike)

@@ -80,7 +80,8 @@ class Evaluation:
     """Value, gradient and curvature at a model, and the posterior of the shapes.
 
     Attributes:
-        value: (*b) minus the log-likelihood, summed over frames.
+        value: (*b) minus the log-likelihood, summed over frames; infinite (and nothing else of use) where it cannot
+            be computed.
         pose: (*b, frames, 4) gradient: rotation vector on the camera side, logarithm of the scale.
         mean, loadings: gradients.
         pose_fisher: (*b, frames, 4, 4) expected information of the poses.
@@ -169,12 +170,15 @@ def evaluate(views: Views, model: ShapeModel, eps: float, *, with_spread: bool =
     design = torch.cat([_whitened(whitener, plane[..., 1:]), whitener], -1).flatten(-3, -2)
     target = _whitened(whitener, error[..., None]).flatten(-3, -2)
     precision = torch.cat([plane.new_ones(modes), plane.new_full((2,), 1e-9)])
-    factor = torch.linalg.cholesky(design.mT @ design + torch.diag(precision))
+    factor, failed = torch.linalg.cholesky_ex(design.mT @ design + torch.diag(precision))
+    # Loadings so large that rounding hides the prior are no family of shapes: a line search turns back there.
+    factor = torch.where(failed[..., None, None] > 0, torch.eye(len(precision)).to(factor), factor)
     weights = torch.cholesky_solve(design.mT @ target, factor)
     rest = target - design @ weights
     half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     scatter = torch.where(seen, whitener.diagonal(dim1=-2, dim2=-1), plane.new_ones(())).log().sum((-1, -2))
     value = (0.5 * (target * rest).sum((-1, -2)) + half - scatter).sum(-1)
+    value = torch.where((failed > 0).any(-1), torch.full_like(value, torch.inf), value)
 
     # Gradient with respect to everything placed in the image.
     inverse = torch.cholesky_inverse(factor)
