@@ -154,8 +154,8 @@ def solve_marginal(
         fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
         # Tracks that show more than one basis have modes: only a body that may be rigid has to prove them.
         draws = 1.0 if views is measured or rank > 1 else float(fixed.noise.mean() / measured.noise.mean())
-        model, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
-        model, eps, rigid = _articulated(fixed, model, eps, draws, generator, params)
+        first, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
+        model, eps, rigid = _articulated(fixed, first, eps, draws, generator, params)
         if asked:
             model = settled(fixed, model, eps, articulation=rigid)
     if asked:
@@ -175,8 +175,9 @@ def solve_marginal(
     turn = float(turn_of_view(model.rotations[0].detach()))
     if turn < params.relief.turn:
         level = _told_noise(fixed, params)
+        value = min(float(answer.value), float(evaluate(fixed, first, eps).value))
         other = other_depth(
-            fixed, model, answer, eps, params.modes, level, draws, params.steps, params.relief, params.descent
+            fixed, model, answer, value, eps, params.modes, level, draws, params.steps, params.relief, params.descent
         )
         if other is not None:
             away = (other - answer.points[0]).detach()

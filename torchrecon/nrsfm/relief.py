@@ -94,6 +94,7 @@ def other_depth(
     views: Views,
     model: ShapeModel,
     answer: Evaluation,
+    value: float,
     eps: float,
     modes: int,
     noise: float,
@@ -106,6 +107,8 @@ def other_depth(
 
     Args:
         model, answer: batches of one.
+        value: least value of the likelihood that is known for these tracks: the other shape has to come near it, and
+            not to that of an answer that gave up likelihood for parts that keep their distances.
         eps: standard deviation of the residual of the answer.
         modes, noise, draws: as for ``grow_loadings``.
         steps: quasi-Newton steps of a round.
@@ -118,12 +121,12 @@ def other_depth(
             for _ in range(params.last_rounds if level == params.levels - 1 else 1):
                 for _ in range(2):
                     other = grow_loadings(views, other, residual, modes, noise, draws)
-                other, value, _ = descend(views, other, residual, steps, descent)
+                other, found, _ = descend(views, other, residual, steps, descent)
         points = evaluate(views, other, eps).points[0]
         change = float((points - answer.points[0]).norm() / answer.points[0].norm())
         # Against a rigid body the modes of the other one have to prove themselves; two families are equals.
         bends = 0.0 if model.loadings.shape[-1] else cost_of_modes(views, other)
-        gain = (float(value - answer.value) + bends) / float(views.visible.sum())
+        gain = (float(found) - value + bends) / float(views.visible.sum())
         if gain < params.evidence and change > params.differs:
             return points
     return None
