@@ -59,7 +59,7 @@ def jobs_of(root: Path, regime: str, smoke: bool) -> list[Job]:
 
     Example:
         >>> [job.name for job in jobs_of(Path("runs"), "turning", smoke=True)]
-        ['table2', 'table3', 'table4', 'table5', 'figures', 'ablation', 'table1']
+        ['table2', 'table3', 'table4', 'table5', 'figures', 'table1', 'ablation']
         >>> [job.name for job in jobs_of(Path("runs"), "turning", smoke=False) if not job.small]
         ['turns', 'prior', 'reliability', 'frontend']
     """
@@ -68,7 +68,6 @@ def jobs_of(root: Path, regime: str, smoke: bool) -> list[Job]:
     tables = root / f"tables-{regime}{tail}"
     jobs = [Job(f"table{n}", f"eval.table{n}", tables, where) for n in (2, 3, 4, 5)]
     jobs.append(Job("figures", "eval.figures", root / f"figures-{regime}{tail}", (*where, "--tables", str(tables))))
-    jobs.append(Job("ablation", "eval.ablation", root / f"ablation{tail}"))
     jobs.append(Job("turns", "eval.turns", root / "turns", small=False, takes=("seed", "fresh")))
     jobs.append(Job("prior", "eval.prior", root / "prior-eval", small=False))
     # The whole grid of the reliability job is hours; its small one shows every part.
@@ -76,6 +75,8 @@ def jobs_of(root: Path, regime: str, smoke: bool) -> list[Job]:
     frontend = Job("frontend", "eval.frontend", root / "frontend", ("--synthetic",), small=False, takes=("seed",))
     jobs += [replace(reliability, kept=True), replace(frontend, kept=True, prints=True)]
     jobs.append(Job("table1", "eval.table1", root / f"table1-{regime}{tail}", where))
+    # Its answers are read by the recogniser that Table 1 has trained.
+    jobs.append(Job("ablation", "eval.ablation", root / f"ablation{tail}"))
     return [job for job in jobs if job.small or not smoke]
 
 

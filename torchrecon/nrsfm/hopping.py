@@ -93,12 +93,12 @@ def _annealed(
         residual = coarse * fall**level
         wide = replace(articulation, deviation=max(articulation.deviation, params.width * residual))
         for _ in range(params.last_rounds if level == params.levels - 1 else 1):
+            if not _plausible(evaluate(views, model, residual).points[0], params):
+                return model, torch.inf
             for _ in range(growth.growths):
                 model = grow_loadings(views, model, residual, growth.modes, growth.noise, growth.draws)
-            points = evaluate(views, model, residual).points[0]
-            if not _plausible(points, params):
-                return model, torch.inf
-            model, _, _ = descend(views, model, residual, growth.steps, descent, find_partners(points, noise, wide))
+            rigid = find_partners(evaluate(views, model, residual).points[0], noise, wide)
+            model, _, _ = descend(views, model, residual, growth.steps, descent, rigid)
     return model, _cost(views, model, eps, params, articulation)
 
 
