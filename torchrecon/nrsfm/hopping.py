@@ -30,6 +30,8 @@ class HoppingParams:
     Attributes:
         hops: moves that are tried at most (count).
         patience: moves in a row that bring nothing after which it ends (count).
+        same: change of the points, relative to their extent, below which the first hop is back where it started: the
+            basin of low rank is that of the term too, and nothing else is tried.
         frames: that it goes over at least, evenly spaced (count).
         turn: between two of these at most (degrees).
         coarse: first standard deviation of the residual.
@@ -46,6 +48,7 @@ class HoppingParams:
 
     hops: int = 12
     patience: int = 4
+    same: float = 0.05
     frames: int = 60
     turn: float = 30.0
     coarse: float = 0.1
@@ -156,6 +159,12 @@ def _whole(part: ShapeModel, index: Tensor, frames: int) -> ShapeModel:
     return replace(part, rotations=nearest_rotation(spread(part.rotations[0])), scale=(scale - scale.mean()).exp())
 
 
+def _change(views: Views, before: ShapeModel, after: ShapeModel, eps: float) -> float:
+    """How far the points of a model are from those of another, relative to their extent."""
+    first, second = evaluate(views, before, eps).points, evaluate(views, after, eps).points
+    return float((second - first).norm() / first.norm())
+
+
 def _wobbled(model: ShapeModel, params: HoppingParams, generator: torch.Generator) -> ShapeModel:
     """The model with smooth random turns added."""
     frames = model.scale.shape[-1]
@@ -177,7 +186,8 @@ def better_basin(
 ) -> ShapeModel:
     """The likeliest of the model and what hops from it lead to; likelihood and term for articulation together.
 
-    The first hop, from the model as it is, ends the search where it shows no parts that keep their distances.
+    The first hop, from the model as it is, ends the search where it comes back to it, and where it shows no parts that
+    keep their distances.
 
     Args:
         model: a batch of one, with modes.
@@ -195,10 +205,11 @@ def better_basin(
     for hop in range(params.hops):
         start = moves[hop % len(moves)](best)
         found, cost = _annealed(some, start, eps, params.coarse, growth, params, articulation, descent)
+        back = hop == 0 and _change(some, best, found, eps) < params.same
         vain = 0 if cost < least else vain + 1
         if cost < least:
             best, least = found, cost
-        if least == torch.inf or vain == params.patience:
+        if back or least == torch.inf or vain == params.patience:
             break
     if least == torch.inf:
         return model
