@@ -16,6 +16,7 @@ import torch
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import interpolated, nearest_rotation, rotation_angle, rotation_from_vector
 from torchrecon.nrsfm.articulation import ArticulationParams, find_partners
+from torchrecon.nrsfm.base import turn_of_view
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.relief import made_deeper
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings
@@ -32,6 +33,8 @@ class HoppingParams:
         patience: moves in a row that bring nothing after which it ends (count).
         same: change of the points, relative to their extent, below which the first hop is back where it started: the
             basin of low rank is that of the term too, and nothing else is tried.
+        view: turn of the view below which nothing is tried: it tells no depth, and the deeper a body the less its
+            distances change (degrees).
         frames: that it goes over at least, evenly spaced (count).
         turn: between two of these at most (degrees).
         coarse: first standard deviation of the residual.
@@ -49,6 +52,7 @@ class HoppingParams:
     hops: int = 12
     patience: int = 4
     same: float = 0.05
+    view: float = 45.0
     frames: int = 60
     turn: float = 30.0
     coarse: float = 0.1
@@ -186,13 +190,15 @@ def better_basin(
 ) -> ShapeModel:
     """The likeliest of the model and what hops from it lead to; likelihood and term for articulation together.
 
-    The first hop, from the model as it is, ends the search where it comes back to it, and where it shows no parts that
-    keep their distances.
+    The model itself where the view hardly turns. The first hop, from the model as it is, ends the search where it
+    comes back to it, and where it shows no parts that keep their distances.
 
     Args:
         model: a batch of one, with modes.
         eps: standard deviation of its residual.
     """
+    if float(turn_of_view(model.rotations[0])) < params.view:
+        return model
     index = _survey_frames(model, params)
     some, best = _part(views, model, index)
     moves = (
