@@ -33,8 +33,8 @@ class HoppingParams:
         patience: moves in a row that bring nothing after which it ends (count).
         same: change of the points, relative to their extent, below which the first hop is back where it started: the
             basin of low rank is that of the term too, and nothing else is tried.
-        view: turn of the view below which nothing is tried: it tells no depth, and the deeper a body the less its
-            distances change (degrees).
+        view: turn of the view below which what was found is no answer: such a view tells no depth, and the deeper a
+            body the less its distances change (degrees).
         frames: that it goes over at least, evenly spaced (count).
         turn: between two of these at most (degrees).
         coarse: first standard deviation of the residual.
@@ -190,15 +190,13 @@ def better_basin(
 ) -> ShapeModel:
     """The likeliest of the model and what hops from it lead to; likelihood and term for articulation together.
 
-    The model itself where the view hardly turns. The first hop, from the model as it is, ends the search where it
-    comes back to it, and where it shows no parts that keep their distances.
+    The first hop, from the model as it is, ends the search where it comes back to it, and where it shows no parts that
+    keep their distances. The model itself where the view of what was found hardly turns.
 
     Args:
         model: a batch of one, with modes.
         eps: standard deviation of its residual.
     """
-    if float(turn_of_view(model.rotations[0])) < params.view:
-        return model
     index = _survey_frames(model, params)
     some, best = _part(views, model, index)
     moves = (
@@ -217,7 +215,7 @@ def better_basin(
             best, least = found, cost
         if back or least == torch.inf or vain == params.patience:
             break
-    if least == torch.inf:
+    if least == torch.inf or float(turn_of_view(best.rotations[0])) < params.view:
         return model
     whole = _whole(best, index, model.scale.shape[-1])
     whole, cost = _annealed(views, whole, eps, params.resumed, growth, params, articulation, descent)
