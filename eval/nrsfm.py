@@ -19,6 +19,7 @@ from typing import Any, Literal
 import torch
 
 import torchrecon as tr
+from eval.floor import known_subspace_floor
 from eval.job import provenance, write_json
 from eval.recordings import CAMERAS as VIEWS
 from eval.recordings import FILE, FPS, at_image_scale, recording, recordings
@@ -166,19 +167,24 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
         # The public figures are of complete, exact tracks from the first camera.
         clean = arguments.camera == "orbit" and arguments.noise == arguments.missing == 0
         row["reference"] = dict(zip(("pnd2", "best_known"), REFERENCE[name] if clean else (None, None), strict=True))
+        if arguments.noise > 0 or arguments.missing > 0:
+            # The unit of the noise is that of ``degrade_tracks``.
+            flat_xy = truth[..., :2] - truth[..., :2].mean(-2, keepdim=True)
+            row["floor"] = known_subspace_floor(tracks, truth, arguments.noise * float(flat_xy.abs().max()))
         row["reference"]["akhter"] = PAPER_AKHTER.get(solver, {}).get(name)
     return row
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as text."""
-    public, people = "reference" in rows[0], "pa_mpjpe_mm" in rows[0]
+    public, people, floor = (key in rows[0] for key in ("reference", "pa_mpjpe_mm", "floor"))
     width = max(10, *(len(row["sequence"]) for row in rows))
     head = (
         f"{'sequence':{width}s} {'solver':10s} {'error3d_camera':>14s} {'flat':>6s} {'K':>4s} {'s':>6s} {'CPU s':>6s}"
     )
     head += f" {'PA mm':>6s}  status" if people else ""
-    lines = [head + (f" {'akhter':>7s} {'paper':>6s} {'PND2':>6s} {'best':>6s}" if public else "")]
+    head += f" {'akhter':>7s} {'paper':>6s} {'PND2':>6s} {'best':>6s}" if public else ""
+    lines = [head + (f" {'floor':>6s}" if floor else "")]
     for row in rows:
         line = f"{row['sequence']:{width}s} {row['solver']:10s} {row['error3d_camera']:14.4f} {row['flat']:6.3f}"
         star = "*" if row["rank_from"] == "estimate" else " "
@@ -186,6 +192,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         if public:
             known = (row["reference"][key] for key in ("akhter", "pnd2", "best_known"))
             line += f" {row['error3d_akhter']:7.4f} " + " ".join("     -" if k is None else f"{k:6.4f}" for k in known)
+            line += f" {row['floor']:6.4f}" if floor else ""
         if people:
             line += f" {row['pa_mpjpe_mm']:6.0f}  {row['status'].split(':')[0]}"
         lines.append(line)
@@ -195,6 +202,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         legend = [
             "at the scale of the image in every frame; PA mm: PA-MPJPE, millimetres, one mirror image per sequence"
         ]
+    if floor:
+        legend.append("floor: of one who knows views, mean, modes and their variances, frame by frame, at the best K")
     observed = "" if people else ", observed entries"
     return "\n".join([*lines, note + ("" if public else f", one scale per sequence{observed}"), *legend, ""])
 
