@@ -169,8 +169,8 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
         row["reference"] = dict(zip(("pnd2", "best_known"), REFERENCE[name] if clean else (None, None), strict=True))
         if arguments.noise > 0 or arguments.missing > 0:
             # The unit of the noise is that of ``degrade_tracks``.
-            flat_xy = truth[..., :2] - truth[..., :2].mean(-2, keepdim=True)
-            row["floor"] = known_subspace_floor(tracks, truth, arguments.noise * float(flat_xy.abs().max()))
+            centred = truth[..., :2] - truth[..., :2].mean(-2, keepdim=True)
+            row["floor"] = known_subspace_floor(tracks, truth, arguments.noise * float(centred.abs().max()))
         row["reference"]["akhter"] = PAPER_AKHTER.get(solver, {}).get(name)
     return row
 

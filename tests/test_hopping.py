@@ -10,9 +10,9 @@ import torch
 from torchrecon.linalg import rotation_angle, rotation_from_vector
 from torchrecon.measurement import Tracks
 from torchrecon.nrsfm.articulation import ArticulationParams
-from torchrecon.nrsfm.hopping import Growth, HoppingParams, _part, _survey_frames, _whole, better_basin
+from torchrecon.nrsfm.hopping import HoppingParams, _part, _survey_frames, _whole, better_basin
 from torchrecon.nrsfm.marginal import MarginalParams, solve_marginal
-from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, tangents
 
 

@@ -17,11 +17,11 @@ from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import interpolated, nearest_rotation, rotation_angle, rotation_from_vector
 from torchrecon.nrsfm.articulation import ArticulationParams, find_partners
 from torchrecon.nrsfm.base import turn_of_view
-from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.relief import made_deeper
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings
 
-__all__ = ["Growth", "HoppingParams", "better_basin"]
+__all__ = ["HoppingParams", "better_basin"]
 
 
 @dataclass(frozen=True)
@@ -64,23 +64,6 @@ class HoppingParams:
     wobble: float = 0.15
     knots: int = 12
     deepest: float = 2.0
-
-
-@dataclass(frozen=True)
-class Growth:
-    """How modes come in, see ``grow_loadings``, and how the descent goes on between.
-
-    Attributes:
-        modes, noise, draws: as for ``grow_loadings``.
-        growths: steps of expectation-maximisation before a descent (count).
-        steps: quasi-Newton steps of a descent (count).
-    """
-
-    modes: int
-    noise: float
-    draws: float
-    growths: int
-    steps: int
 
 
 def _annealed(

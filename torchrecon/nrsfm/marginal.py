@@ -23,10 +23,10 @@ from torchrecon.nrsfm.base import check_size, solve_items, turn_of_view
 from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
-from torchrecon.nrsfm.hopping import Growth, HoppingParams, better_basin
+from torchrecon.nrsfm.hopping import HoppingParams, better_basin
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
-from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.relief import ReliefParams, other_depth
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, cost_of_modes, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
@@ -155,7 +155,8 @@ def solve_marginal(
         # Tracks that show more than one basis have modes: only a body that may be rigid has to prove them.
         draws = 1.0 if views is measured or rank > 1 else float(fixed.noise.mean() / measured.noise.mean())
         first, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
-        model, eps, rigid = _articulated(fixed, first, eps, draws, generator, params)
+        growth = Growth(params.modes, _told_noise(fixed, params), draws, params.growths, params.steps)
+        model, eps, rigid = _articulated(fixed, first, eps, growth, generator, params)
         if asked:
             model = settled(fixed, model, eps, articulation=rigid)
     if asked:
@@ -174,11 +175,8 @@ def solve_marginal(
     doubt = None
     turn = float(turn_of_view(model.rotations[0].detach()))
     if turn < params.relief.turn:
-        level = _told_noise(fixed, params)
         value = min(float(answer.value), float(evaluate(fixed, first, eps).value))
-        other = other_depth(
-            fixed, model, answer, value, eps, params.modes, level, draws, params.steps, params.relief, params.descent
-        )
+        other = other_depth(fixed, model, answer, value, eps, growth, params.relief, params.descent)
         if other is not None:
             away = (other - answer.points[0]).detach()
             covariance = covariance + away[..., :, None] * away[..., None, :]
@@ -204,7 +202,7 @@ def solve_marginal(
 
 
 def _articulated(
-    views: Views, model: ShapeModel, eps: float, draws: float, generator: torch.Generator, params: MarginalParams
+    views: Views, model: ShapeModel, eps: float, growth: Growth, generator: torch.Generator, params: MarginalParams
 ) -> tuple[ShapeModel, float, Articulation | None]:
     """The answer, its residual and the pairs that keep their distance; as it was where there are none.
 
@@ -222,7 +220,6 @@ def _articulated(
         return model, eps, None
     found, level = model, max(eps, params.fine)
     if eps >= level or unmet(model, eps) > params.articulation.believed:
-        growth = Growth(params.modes, _told_noise(views, params), draws, params.growths, params.steps)
         found = better_basin(
             views, model, level, growth, generator, params.hopping, params.articulation, params.descent
         )

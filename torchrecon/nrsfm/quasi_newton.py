@@ -16,7 +16,7 @@ from torchrecon._typing import Tensor
 from torchrecon.nrsfm.articulation import Articulation, evaluate_with
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, moved
 
-__all__ = ["DescentParams", "Direction", "added", "descend", "inner", "metric", "scaled"]
+__all__ = ["DescentParams", "Direction", "Growth", "added", "descend", "inner", "metric", "scaled"]
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,23 @@ class DescentParams:
     turn: float = 0.4
     halvings: int = 8
     sufficient: float = 1e-4
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How modes come in, see ``grow_loadings``, and how the descent goes on in between.
+
+    Attributes:
+        modes, noise, draws: as for ``grow_loadings``.
+        growths: steps of expectation-maximisation before a descent (count).
+        steps: quasi-Newton steps of a descent (count).
+    """
+
+    modes: int
+    noise: float
+    draws: float
+    growths: int
+    steps: int
 
 
 Direction = tuple[Tensor, Tensor, Tensor]

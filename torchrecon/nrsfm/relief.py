@@ -15,7 +15,7 @@ import torch
 
 from torchrecon._typing import Float, Tensor
 from torchrecon.linalg import nearest_rotation, rotation_angle, rotation_from_vector
-from torchrecon.nrsfm.quasi_newton import DescentParams, descend
+from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.shape_likelihood import (
     Evaluation,
     ShapeModel,
@@ -96,10 +96,7 @@ def other_depth(
     answer: Evaluation,
     value: float,
     eps: float,
-    modes: int,
-    noise: float,
-    draws: float,
-    steps: int,
+    growth: Growth,
     params: ReliefParams,
     descent: DescentParams,
 ) -> Float[Tensor, "frames points 3"] | None:
@@ -110,8 +107,6 @@ def other_depth(
         value: least value of the likelihood that is known for these tracks: the other shape has to come near it, and
             not to that of an answer that gave up likelihood for parts that keep their distances.
         eps: standard deviation of the residual of the answer.
-        modes, noise, draws: as for ``grow_loadings``.
-        steps: quasi-Newton steps of a round.
     """
     fall = (eps / params.coarse) ** (1 / (params.levels - 1))
     for factor in (params.factor, 1 / params.factor):
@@ -119,9 +114,9 @@ def other_depth(
         for level in range(params.levels):
             residual = params.coarse * fall**level
             for _ in range(params.last_rounds if level == params.levels - 1 else 1):
-                for _ in range(2):
-                    other = grow_loadings(views, other, residual, modes, noise, draws)
-                other, found, _ = descend(views, other, residual, steps, descent)
+                for _ in range(growth.growths):
+                    other = grow_loadings(views, other, residual, growth.modes, growth.noise, growth.draws)
+                other, found, _ = descend(views, other, residual, growth.steps, descent)
         points = evaluate(views, other, eps).points[0]
         change = float((points - answer.points[0]).norm() / answer.points[0].norm())
         # Against a rigid body the modes of the other one have to prove themselves; two families are equals.
