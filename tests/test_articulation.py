@@ -68,16 +68,16 @@ def test_partners_are_points_of_the_same_segment():
 def test_cost_is_nothing_for_rigid_pairs_and_bounded_for_others():
     shape = _limbs(50)
     zoom = torch.linspace(1.0, 1.5, 50)[:, None, None]
-    rigid = Articulation(torch.tensor([[0, 5], [9, 13], [17, 22]]), 1e-4, 2.0, 1.0)
+    rigid = Articulation(torch.tensor([[0, 5], [9, 13], [17, 22]]), 0.01, 0.0, 2.0, 1.0)
     assert float(rigid.cost(zoom * shape)) < 1e-6
-    across = Articulation(torch.tensor([[0, 13], [5, 22]]), 1e-4, 2.0, 1.0)
+    across = Articulation(torch.tensor([[0, 13], [5, 22]]), 0.01, 0.0, 2.0, 1.0)
     assert 0.5 * 50 < float(across.cost(shape)) <= 0.5 * 50 * 4 * 2
 
 
 def test_gradient_with_the_term_is_that_of_differences():
     g = torch.Generator().manual_seed(0)
     views, model = _model(7, 9, 2, g)
-    term = Articulation(torch.tensor([[0, 1], [2, 5], [3, 8], [4, 6]]), 0.5, 2.0, 3.0)
+    term = Articulation(torch.tensor([[0, 1], [2, 5], [3, 8], [4, 6]]), 0.7, 0.005, 2.0, 3.0)
     found = evaluate_with(term, views, model, 0.1)
     plain = evaluate(views, model, 0.1)
     torch.testing.assert_close(found.value, plain.value + term.cost(plain.points))

@@ -10,14 +10,14 @@ Derived here; the loss is Geman and McClure's (1987).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, moved
 
-__all__ = ["Articulation", "ArticulationParams", "evaluate_with", "find_partners"]
+__all__ = ["Articulation", "ArticulationParams", "broken", "evaluate_with", "find_partners"]
 
 
 @dataclass(frozen=True)
@@ -28,22 +28,26 @@ class ArticulationParams:
         partners: of each point (count); none leaves the term out.
         blurred: deviation that noise gives to a distance beyond which no rigid pair can be told.
         deviation: of the distance in a rigid pair at least; noise comes on top.
-        loosest: the same at most. In between, what three quarters of the pairs keep to: markers on skin are looser
-            than points on bones.
+        loosest: the same at most. In between, what the pairs show: markers on skin are looser than points on bones.
+        keep: share of the pairs that keep to what they show.
         gives_up: times that deviation at which a pair has lost half of its pull (no unit).
         weight: of the term against the likelihood; pairs are many and not independent (no unit).
-        believed: share of what the term can cost at most up to which a body is taken for articulated. Bodies and faces
-            with the term in end at .09 to .27, random smooth deformations without any parts at .39 to .89.
+        judged: deviation at which it is asked whether a body is articulated at all.
+        believed: share of what the term can cost there up to which it is.
+        fallen: the same relative to what it was without the term: smooth deformations without parts keep .92 or more.
         steps: quasi-Newton steps with the term (count).
     """
 
-    partners: int = 4
+    partners: int = 3
     blurred: float = 0.1
-    deviation: float = 0.01
+    deviation: float = 0.002
     loosest: float = 0.02
+    keep: float = 0.75
     gives_up: float = 2.0
     weight: float = 0.5
+    judged: float = 0.01
     believed: float = 0.33
+    fallen: float = 0.67
     steps: int = 25
 
 
@@ -53,12 +57,14 @@ class Articulation:
 
     Attributes:
         pairs: (pairs, 2) indices of points.
-        variance: of the distance in a rigid pair, noise included.
+        width: deviation of the distance in a rigid pair.
+        noise: variance of a coordinate that is measured.
         gives_up, weight: as in the parameters.
     """
 
     pairs: Int[Tensor, "pairs 2"]
-    variance: float
+    width: float
+    noise: float
     gives_up: float
     weight: float
 
@@ -72,7 +78,7 @@ class Articulation:
 
     def _lost(self, points: Tensor) -> Float[Tensor, "*b pairs"]:
         varies = _variation(points, self.pairs)
-        return varies / (varies + self.gives_up**2 * self.variance)
+        return varies / (varies + self.gives_up**2 * (self.width**2 + 2 * self.noise))
 
 
 def _distances(points: Tensor, pairs: Tensor) -> Float[Tensor, "*b frames pairs"]:
@@ -121,9 +127,26 @@ def find_partners(
     nearest = table.topk(params.partners, largest=False).indices
     own = torch.arange(count, device=points.device)[:, None].expand_as(nearest)
     pairs = torch.stack([torch.minimum(own, nearest), torch.maximum(own, nearest)], -1).flatten(0, 1).unique(dim=0)
-    shown = float(_variation(points, pairs).quantile(0.75)) - 2 * noise
-    variance = min(max(shown, params.deviation**2), max(params.loosest, params.deviation) ** 2)
-    return Articulation(pairs, variance + 2 * noise, params.gives_up, params.weight)
+    shown = float(_variation(points, pairs).quantile(params.keep)) - 2 * noise
+    width = min(max(shown, 0.0) ** 0.5, params.loosest)
+    width = max(width, params.deviation)
+    return Articulation(pairs, width, noise, params.gives_up, params.weight)
+
+
+def broken(points: Float[Tensor, "frames points 3"], noise: float, params: ArticulationParams) -> float:
+    """How far a body is from keeping the distances in its pairs to ``params.judged``: 0 for rigid parts, 1 for none.
+
+    Args:
+        noise: variance of a coordinate that is measured.
+
+    Example:
+        >>> import torch
+        >>> points = torch.randn(40, 12, 3, generator=torch.Generator().manual_seed(0))
+        >>> broken(points, 0.0, ArticulationParams()) > 0.9
+        True
+    """
+    rigid = find_partners(points, noise, replace(params, deviation=params.judged, loosest=params.judged))
+    return 1.0 if rigid is None else float(rigid.unmet(points))
 
 
 def evaluate_with(articulation: Articulation, views: Views, model: ShapeModel, eps: float) -> Evaluation:

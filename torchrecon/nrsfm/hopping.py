@@ -15,7 +15,7 @@ import torch
 
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg import interpolated, nearest_rotation, rotation_angle, rotation_from_vector
-from torchrecon.nrsfm.articulation import ArticulationParams, find_partners
+from torchrecon.nrsfm.articulation import ArticulationParams, broken, find_partners
 from torchrecon.nrsfm.base import turn_of_view
 from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.relief import made_deeper
@@ -36,7 +36,7 @@ class HoppingParams:
         view: turn of the view below which what was found is no answer: such a view tells no depth, and the deeper a
             body the less its distances change (degrees).
         frames: that it goes over at least, evenly spaced (count).
-        turn: between two of these at most (degrees).
+        turn: between two of these at most, but for every tenth (degrees).
         coarse: first standard deviation of the residual.
         resumed: the same where the winner is brought to all frames.
         levels: of the residual, geometric down to that of the answer (count).
@@ -58,7 +58,7 @@ class HoppingParams:
     coarse: float = 0.1
     resumed: float = 0.03
     levels: int = 8
-    width: float = 3.0
+    width: float = 1.0
     last_rounds: int = 3
     factor: float = 1.4
     wobble: float = 0.15
@@ -75,21 +75,20 @@ def _annealed(
     params: HoppingParams,
     articulation: ArticulationParams,
     descent: DescentParams,
-) -> tuple[ShapeModel, float]:
-    """The model where residual and width of the term have fallen together, and what it costs there, see ``_cost``."""
-    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+) -> ShapeModel | None:
+    """The model where residual and width of the term have fallen together; None where it became deeper than bodies."""
     fall = (eps / coarse) ** (1 / (params.levels - 1))
     for level in range(params.levels):
         residual = coarse * fall**level
         wide = replace(articulation, deviation=max(articulation.deviation, params.width * residual))
         for _ in range(params.last_rounds if level == params.levels - 1 else 1):
             if not _plausible(evaluate(views, model, residual).points[0], params):
-                return model, torch.inf
+                return None
             for _ in range(growth.growths):
                 model = grow_loadings(views, model, residual, growth.modes, growth.noise, growth.draws)
-            rigid = find_partners(evaluate(views, model, residual).points[0], noise, wide)
+            rigid = find_partners(evaluate(views, model, residual).points[0], _noise(views), wide)
             model, _, _ = descend(views, model, residual, growth.steps, descent, rigid)
-    return model, _cost(views, model, eps, params, articulation)
+    return model
 
 
 def _plausible(points: Float[Tensor, "frames points 3"], params: HoppingParams) -> bool:
@@ -97,21 +96,29 @@ def _plausible(points: Float[Tensor, "frames points 3"], params: HoppingParams) 
     return float(points[..., 2].norm()) <= params.deepest * float(points[..., :2].norm())
 
 
-def _cost(
-    views: Views, model: ShapeModel, eps: float, params: HoppingParams, articulation: ArticulationParams
-) -> float:
-    """Likelihood and term at the last residual, nats a frame.
-
-    Infinite where it is no answer: deeper than bodies are, or one that keeps too few distances.
-    """
+def _cost(views: Views, model: ShapeModel, eps: float, width: float, articulation: ArticulationParams) -> float:
+    """Likelihood and term at the last residual, nats a frame, the width being the same for all that are compared."""
     answer = evaluate(views, model, eps)
-    if not _plausible(answer.points[0], params):
-        return torch.inf
-    alike = replace(articulation, loosest=articulation.deviation)  # one width for all answers, or costs do not compare
-    rigid = find_partners(answer.points[0], float(views.noise.diagonal(dim1=-2, dim2=-1).mean()), alike)
-    if rigid is None or float(rigid.unmet(answer.points)) > articulation.believed:
-        return torch.inf
+    rigid = find_partners(answer.points[0], _noise(views), replace(articulation, deviation=width, loosest=width))
+    assert rigid is not None
     return (float(answer.value) + float(rigid.cost(answer.points))) / model.scale.shape[-1]
+
+
+def _shown(
+    views: Views, model: ShapeModel | None, eps: float, params: HoppingParams, articulation: ArticulationParams
+) -> float | None:
+    """The width that the pairs of an answer show; None where it is none: too deep, or not articulated."""
+    if model is None:
+        return None
+    points = evaluate(views, model, eps).points[0]
+    if not _plausible(points, params) or broken(points, _noise(views), articulation) > articulation.believed:
+        return None
+    rigid = find_partners(points, _noise(views), articulation)
+    return None if rigid is None else rigid.width
+
+
+def _noise(views: Views) -> float:
+    return float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
 
 
 def _survey_frames(model: ShapeModel, params: HoppingParams) -> Int[Tensor, " chosen"]:
@@ -120,7 +127,7 @@ def _survey_frames(model: ShapeModel, params: HoppingParams) -> Int[Tensor, " ch
     step = max(1, frames // params.frames)
     while step > 1:
         chosen = model.rotations[0, ::step]
-        if float(rotation_angle(chosen[1:] @ chosen[:-1].mT).max()) <= torch.pi / 180 * params.turn:
+        if float(rotation_angle(chosen[1:] @ chosen[:-1].mT).quantile(0.9)) <= torch.pi / 180 * params.turn:
             break
         step -= 1
     return torch.arange(0, frames, step, device=model.scale.device)
@@ -188,18 +195,41 @@ def better_basin(
         lambda start: made_deeper(start, params.factor),
         lambda start: _wobbled(start, params, generator),
     )
-    least, vain = torch.inf, 0
+    width, vain = articulation.loosest, 0
     for hop in range(params.hops):
-        start = moves[hop % len(moves)](best)
-        found, cost = _annealed(some, start, eps, params.coarse, growth, params, articulation, descent)
-        back = hop == 0 and _change(some, best, found, eps) < params.same
-        vain = 0 if cost < least else vain + 1
-        if cost < least:
-            best, least = found, cost
-        if back or least == torch.inf or vain == params.patience:
+        found = _annealed(
+            some, moves[hop % len(moves)](best), eps, params.coarse, growth, params, articulation, descent
+        )
+        shown = _shown(some, found, eps, params, articulation)
+        if found is None or shown is None:
+            if hop == 0:
+                return model
+            vain += 1
+        else:
+            # Costs compare at one width only: the tightest that an answer has shown.
+            width = min(width, shown)
+            gain = _cost(some, best, eps, width, articulation) - _cost(some, found, eps, width, articulation)
+            if hop == 0 and _change(some, best, found, eps) < params.same:
+                best = found
+                break
+            if hop == 0 or gain > 0:
+                best = found
+            vain = 0 if gain > 0 else vain + 1
+        if vain == params.patience:
             break
-    if least == torch.inf or float(turn_of_view(best.rotations[0])) < params.view:
+    if float(turn_of_view(best.rotations[0])) < params.view:
         return model
-    whole = _whole(best, index, model.scale.shape[-1])
-    whole, cost = _annealed(views, whole, eps, params.resumed, growth, params, articulation, descent)
-    return whole if cost < _cost(views, model, eps, params, articulation) else model
+    whole = _annealed(
+        views,
+        _whole(best, index, model.scale.shape[-1]),
+        eps,
+        params.resumed,
+        growth,
+        params,
+        articulation,
+        descent,
+    )
+    if whole is None or _shown(views, whole, eps, params, articulation) is None:
+        return model
+    before = _cost(views, model, eps, width, articulation)
+    return whole if _cost(views, whole, eps, width, articulation) < before else model

@@ -18,7 +18,7 @@ import torch
 from torchrecon._typing import Float, Int, Tensor
 from torchrecon.linalg.noise_edge import difference_noise, marchenko_pastur_tail
 from torchrecon.measurement import Reconstruction, Status, Tracks
-from torchrecon.nrsfm.articulation import Articulation, ArticulationParams, find_partners
+from torchrecon.nrsfm.articulation import Articulation, ArticulationParams, broken, find_partners
 from torchrecon.nrsfm.base import check_size, solve_items, turn_of_view
 from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
@@ -208,28 +208,27 @@ def _articulated(
 
     An exact family, whose residual went on falling, is left where it is unless it breaks its pairs.
     """
-    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
-    strict = replace(params.articulation, loosest=params.articulation.deviation)
-
-    def unmet(model: ShapeModel, eps: float) -> float:
-        points = evaluate(views, model, eps).points[0]
-        rigid = find_partners(points, noise, strict)
-        return 1.0 if rigid is None else float(rigid.unmet(points))
-
     if not model.loadings.shape[-1]:
         return model, eps, None
+    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+    articulation = params.articulation
+
+    def share(model: ShapeModel, eps: float) -> float:
+        return broken(evaluate(views, model, eps).points[0], noise, articulation)
+
+    before = share(model, eps)
+    believed = max(articulation.believed, articulation.fallen * before)
     found, level = model, max(eps, params.fine)
-    if eps >= level or unmet(model, eps) > params.articulation.believed:
-        found = better_basin(
-            views, model, level, growth, generator, params.hopping, params.articulation, params.descent
-        )
+    if eps >= level or before > articulation.believed:
+        pairs = replace(articulation, believed=believed)
+        found = better_basin(views, model, level, growth, generator, params.hopping, pairs, params.descent)
     else:
         level = eps
-    rigid = find_partners(evaluate(views, found, level).points[0], noise, params.articulation)
+    rigid = find_partners(evaluate(views, found, level).points[0], noise, articulation)
     if rigid is None:
         return model, eps, None
-    found, _, _ = descend(views, found, level, params.articulation.steps, params.descent, rigid)
-    if unmet(found, level) > params.articulation.believed:
+    found, _, _ = descend(views, found, level, articulation.steps, params.descent, rigid)
+    if share(found, level) > believed:
         return model, eps, None
     return found, level, rigid
 

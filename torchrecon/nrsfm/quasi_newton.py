@@ -131,6 +131,7 @@ def descend(
     now = judged(model)
     pairs: list[tuple[Direction, Direction, Tensor]] = []
     done = torch.zeros_like(now.value, dtype=torch.bool)
+    reach = torch.ones_like(now.value)
     for _ in range(steps):
         precondition = metric(model, now.pose_fisher, residual)
         q, kept = _gradient(now), []
@@ -150,7 +151,8 @@ def descend(
             slope = -inner(q, _gradient(now))
             pairs = [(s, c, torch.where(lost, torch.zeros_like(w), w)) for s, c, w in pairs]
         turn = q[0][..., :3].norm(dim=-1).amax(-1)
-        length = torch.where(done, torch.zeros_like(turn), (params.turn / turn.clamp_min(1e-300)).clamp_max(1.0))
+        length = torch.where(done, torch.zeros_like(turn), torch.minimum(params.turn / turn.clamp_min(1e-300), reach))
+        tried = length
         for _ in range(params.halvings):
             step = scaled(-length, q)
             trial = moved(model, *step)
@@ -164,6 +166,8 @@ def descend(
             step = scaled(-length, q)
             trial = moved(model, *step)
             then = judged(trial)
+        # A step as long as the last one that was accepted, longer where that was so at once.
+        reach = torch.where(length == tried, length / 0.4, length).clamp(1e-3, 1.0)
         change = added(_gradient(then), -torch.ones_like(length), _gradient(now))
         curvature = inner(step, change)
         usable = curvature > 1e-10 * (length * slope).abs()
