@@ -1,8 +1,9 @@
 """Solvers on sequences with known 3D: ``python -m eval.nrsfm [--data ../shared/data/nrsfm]``.
 
-With ``--data``: the field's eight public sequences, complete tracks, orthographic; or, where the folder is that of the
-keypoints, HumanEva: 15 joints of people before one real camera that stands (``--view``). Without: surface points of
-the synthetic world, seen in bands of 15 to 40 frames as real tracks are, pinhole camera turning about the player.
+With ``--data``: the field's eight public sequences, complete tracks, orthographic; where the folder is that of the
+keypoints, HumanEva: 15 joints of people before one real camera that stands (``--view``); where it is that of the motion
+capture, 31 joints in a sample of everyday trials before a camera that turns. Without: surface points of the synthetic
+world, seen in bands of 15 to 40 frames as real tracks are, pinhole camera turning about the player.
 One configuration, nothing chosen per sequence, and no K given unless ``--rank`` says so: ``paper`` takes the K that
 the papers of the known methods picked by hand for each sequence. Ground truth is read by the metric alone.
 """
@@ -23,6 +24,8 @@ from eval.floor import known_subspace_floor
 from eval.job import provenance, write_json
 from eval.recordings import CAMERAS as VIEWS
 from eval.recordings import FILE, FPS, at_image_scale, recording, recordings
+from eval.trials import FILE as TRIALS
+from eval.trials import sample, trial, trials
 from torchrecon.data.benchmarks import SEQUENCES, Benchmark, load_benchmark
 from torchrecon.data.synthetic import ACTIONS, SyntheticClip, sample_body, sample_motion, turning_camera
 from torchrecon.data.views import CAMERAS, degrade_tracks, film_again
@@ -109,9 +112,14 @@ def _is_keypoints(data: str | None) -> bool:
     return data is not None and (Path(data) / FILE).is_file()
 
 
+def _is_mocap(data: str | None) -> bool:
+    return data is not None and (Path(data) / TRIALS).is_file()
+
+
 def _public(name: str, arguments: argparse.Namespace) -> tuple[Benchmark, torch.Tensor]:
-    """A public sequence and its truth in the axes of the camera that is asked for."""
-    sequence = load_benchmark(name, arguments.data)
+    """A sequence with its truth in the axes of the camera that is asked for."""
+    mocap = _is_mocap(arguments.data)
+    sequence = trial(name, Path(arguments.data)) if mocap else load_benchmark(name, arguments.data)
     if arguments.camera == "orbit":
         return sequence, sequence.points3d
     if sequence.canonical is None:
@@ -166,7 +174,8 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
         row["error3d_akhter"] = float(error3d_akhter(*pair))
         # The public figures are of complete, exact tracks from the first camera.
         clean = arguments.camera == "orbit" and arguments.noise == arguments.missing == 0
-        row["reference"] = dict(zip(("pnd2", "best_known"), REFERENCE[name] if clean else (None, None), strict=True))
+        known = REFERENCE.get(name, (None, None)) if clean else (None, None)
+        row["reference"] = dict(zip(("pnd2", "best_known"), known, strict=True))
         if arguments.noise > 0 or arguments.missing > 0:
             # The unit of the noise is that of ``degrade_tracks``.
             centred = truth[..., :2] - truth[..., :2].mean(-2, keepdim=True)
@@ -219,11 +228,11 @@ def _gaps(text: str) -> tuple[int, int]:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and write ``nrsfm.json`` and ``nrsfm.txt``."""
     parser = argparse.ArgumentParser(prog="python -m eval.nrsfm", description=__doc__)
-    parser.add_argument("--data", metavar="DIR", help="nrsfm/ or keypoints/ folder; default: the synthetic world")
-    parser.add_argument("--sequence", nargs="+", metavar="NAME", help="default: all")
+    parser.add_argument("--data", metavar="DIR", help="nrsfm/, keypoints/ or mocap/ folder; default: synthetic")
+    parser.add_argument("--sequence", nargs="+", metavar="NAME", help="default: all, or a sample of mocap/")
     parser.add_argument("--solver", nargs="+", default=["auto"], metavar="NAME")
     parser.add_argument("--rank", default="auto", metavar="auto|paper|K", help="number of shape bases")
-    parser.add_argument("--camera", default="orbit", choices=("orbit", *CAMERAS), help="of the public sequences")
+    parser.add_argument("--camera", default="orbit", choices=("orbit", *CAMERAS), help="of public sequences and mocap")
     parser.add_argument("--view", type=int, default=0, choices=range(VIEWS), help="camera of HumanEva")
     parser.add_argument("--noise", type=float, default=0.0, metavar="S", help="std, share of the largest coordinate")
     parser.add_argument("--missing", type=float, default=0.0, metavar="SHARE", help="share of entries not seen")
@@ -238,12 +247,14 @@ def main(arguments: list[str] | None = None) -> int:
         if _is_keypoints(options.data):
             if options.camera != "orbit":
                 raise ReconError(f"--camera {options.camera}: HumanEva is taken as filmed; --view picks a camera")
-            known = tuple(recordings(Path(options.data)))
+            known = asked = recordings(Path(options.data))
+        elif _is_mocap(options.data):
+            known, asked = trials(Path(options.data)), sample(Path(options.data))
         else:
-            known = SEQUENCES if options.data is not None else ACTIONS[:5]
-        for name in options.sequence or known:
+            known = asked = list(SEQUENCES if options.data is not None else ACTIONS[:5])
+        for name in options.sequence or asked:
             if name not in known:
-                raise ReconError(f"--sequence {name}: is not one of {', '.join(known)}")
+                raise ReconError(f"--sequence {name}: is not one of {', '.join(known[:20])}")
             for solver in options.solver:
                 rows.append(measure(name, solver, options))
                 print(table(rows[-1:]).splitlines()[1], file=sys.stderr, flush=True)

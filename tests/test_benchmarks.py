@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
 from eval.recordings import CAMERAS, at_image_scale, recording, recordings
+from eval.trials import sample, trial, trials
 from torchrecon.data.benchmarks import SEQUENCES, load_benchmark
 from torchrecon.errors import ReconError
+from torchrecon.linalg import nearest_rotation, rotation_angle
 from torchrecon.metrics import error3d_akhter
 
 SHAPES = {
@@ -61,3 +66,27 @@ def test_humaneva_is_seen_by_the_camera_that_its_pixels_tell_of(data_dir):
             # what is left is perspective within the body
             assert float((seen - flat).norm() / flat.norm()) < 0.08
             assert float((metres - metres.mean(1, keepdim=True)).norm(dim=-1).max()) < 2.0  # a person, in metres
+
+
+def test_trials_of_the_motion_capture_turn_before_the_camera(tmp_path):
+    names, lengths = ("pelvis", "neck", "hand"), (100, 89, 300)
+    g = torch.Generator().manual_seed(0)
+    arrays = {f"clip_{i:04d}": torch.randn(n, 3, 3, generator=g).numpy() for i, n in enumerate(lengths)}
+    fields = {k: np.array(["walk"] * 3) for k in ("label", "subject", "trial", "source", "quality", "license")}
+    np.savez(
+        tmp_path / "general.npz",
+        joints=np.array(names),
+        parents=np.array([-1, 0, 1]),
+        n_clips=3,
+        fps=np.array([30.0] * 3),
+        **fields,
+        **arrays,
+    )
+    assert trials(tmp_path) == ["0000-walk", "0002-walk"]
+    assert sample(tmp_path) == ["0000-walk"]
+    found = trial("0002-walk", tmp_path)
+    assert found.points3d.shape == (240, 3, 3)
+    step = nearest_rotation(found.points3d.mT @ found.canonical)
+    torch.testing.assert_close(rotation_angle(step[1:] @ step[:-1].mT), torch.full((239,), math.radians(5)).double())
+    with pytest.raises(ReconError, match="0001-walk"):
+        trial("0001-walk", tmp_path)
