@@ -1,8 +1,9 @@
 """Everything on one page: ``python -m eval.all``.
 
 Runs the jobs of all tables and figures one after another, each from its own cache, so that an interrupted run goes on
-where it was, and writes one self-contained page: tables with their definitions, figures, and every prose claim of the
-paper with what became of it. ``--page``: no job is run, the page shows what is there.
+where it was; a job whose result comes from this very code is not run again. Then it writes one self-contained page:
+tables with their definitions, figures, and every prose claim of the paper with what became of it. ``--page``: no job is
+run, the page shows what is there.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import html
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,6 @@ class Job:
     Attributes:
         name, module, out: of its files, of its code, and its folder.
         arguments: of its command line.
-        kept: it has no cache to go on from, so it is left out where its result comes from this very code.
         small: it has a version that fits into the smoke run.
         prints: it writes no text of its own; what it prints is kept.
         takes: the options of all jobs that it knows.
@@ -48,7 +48,6 @@ class Job:
     module: str
     out: Path
     arguments: tuple[str, ...] = ()
-    kept: bool = False
     small: bool = True
     prints: bool = False
     takes: tuple[str, ...] = ("seed", "smoke", "fresh")
@@ -72,8 +71,10 @@ def jobs_of(root: Path, regime: str, smoke: bool) -> list[Job]:
     jobs.append(Job("prior", "eval.prior", root / "prior-eval", small=False))
     # The whole grid of the reliability job is hours; its small one shows every part.
     reliability = Job("reliability", "eval.reliability", root / "reliability", ("--smoke",), small=False, takes=())
-    frontend = Job("frontend", "eval.frontend", root / "frontend", ("--synthetic",), small=False, takes=("seed",))
-    jobs += [replace(reliability, kept=True), replace(frontend, kept=True, prints=True)]
+    frontend = Job(
+        "frontend", "eval.frontend", root / "frontend", ("--synthetic",), small=False, prints=True, takes=("seed",)
+    )
+    jobs += [reliability, frontend]
     jobs.append(Job("table1", "eval.table1", root / f"table1-{regime}{tail}", where))
     # Its answers are read by the recogniser that Table 1 has trained.
     jobs.append(Job("ablation", "eval.ablation", root / f"ablation{tail}"))
@@ -81,13 +82,17 @@ def jobs_of(root: Path, regime: str, smoke: bool) -> list[Job]:
 
 
 def run_job(job: Job, arguments: argparse.Namespace) -> str | None:
-    """Run one job in a process of its own; its last sentence where it fails."""
+    """Run one job in a process of its own; its last sentence where it fails.
+
+    A job is left out where its result was written by this very code and command, and by nothing since.
+    """
     command = [sys.executable, "-m", job.module, "-o", str(job.out), *job.arguments]
     command += ["--seed", str(arguments.seed)] * ("seed" in job.takes)
     command += [f"--{name}" for name in ("smoke", "fresh") if name in job.takes and getattr(arguments, name)]
-    code = {"code": source_digest("torchrecon", "eval"), "command": command[2:]}
-    stamp = job.out / "code.json"
-    if job.kept and _there(job) and stamp.is_file() and read_json(stamp) == code:
+    code = {"code": source_digest("torchrecon", "eval", "train"), "command": command[2:]}
+    result, stamp = (job.out / f"{job.name}{tail}.json" for tail in ("", "-code"))
+    known = _there(job) and stamp.is_file() and result.stat().st_mtime <= stamp.stat().st_mtime
+    if known and not arguments.fresh and read_json(stamp) == code:
         print(f"== {job.name}: kept, the result of this code is there", flush=True)
         return None
     print(f"== {job.name}: python -m {' '.join(command[2:])}", flush=True)
@@ -95,8 +100,7 @@ def run_job(job: Job, arguments: argparse.Namespace) -> str | None:
     if done.returncode == 0:
         if job.prints:
             write_text(job.out / f"{job.name}.txt", done.stdout)
-        if job.kept:
-            write_json(stamp, code)
+        write_json(stamp, code)
         return None
     said = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
     return f"{job.name} ended with exit code {done.returncode}: {said[-1]}"

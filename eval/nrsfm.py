@@ -170,6 +170,7 @@ def measure(name: str, solver: str, arguments: argparse.Namespace) -> dict[str, 
     if sequence is not None:
         # Shapes in world axes where the sequence has them, else with the estimated camera applied.
         world = sequence.canonical is not None and name != "dance" and arguments.camera == "orbit"
+        world = world and not _is_mocap(arguments.data)
         pair = (answer.canonical, sequence.canonical) if world else (answer.points3d, truth)
         row["error3d_akhter"] = float(error3d_akhter(*pair))
         # The public figures are of complete, exact tracks from the first camera.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -140,8 +141,8 @@ def test_claims_about_bases_and_stages_are_read_from_the_ablation():
             assert judge(claim, {"ablation": {}}).holds is None
 
 
-def test_a_job_without_a_cache_is_kept_while_the_code_is_the_same(tmp_path, monkeypatch):
-    job = everything.Job("said", "eval.said", tmp_path / "said", ("word",), kept=True, prints=True, takes=("seed",))
+def test_a_job_is_kept_while_its_code_and_result_are_the_same(tmp_path, monkeypatch):
+    job = everything.Job("said", "eval.said", tmp_path / "said", ("word",), prints=True, takes=("seed",))
     commands = []
 
     def run(command, **_):
@@ -150,7 +151,7 @@ def test_a_job_without_a_cache_is_kept_while_the_code_is_the_same(tmp_path, monk
         return subprocess.CompletedProcess(command, 0, stdout="a word\n", stderr="")
 
     monkeypatch.setattr(everything.subprocess, "run", run)
-    arguments = argparse.Namespace(seed=3, smoke=True, fresh=True)
+    arguments = argparse.Namespace(seed=3, smoke=True, fresh=False)
     assert everything.run_job(job, arguments) is None
     assert commands == [["-o", str(job.out), "word", "--seed", "3"]]
     assert (job.out / "said.txt").read_text() == "a word\n"
@@ -159,3 +160,11 @@ def test_a_job_without_a_cache_is_kept_while_the_code_is_the_same(tmp_path, monk
     monkeypatch.setattr(everything, "source_digest", lambda *_: "changed")
     assert everything.run_job(job, arguments) is None
     assert len(commands) == 2
+    later = (job.out / "said.json").stat().st_mtime + 100
+    os.utime(job.out / "said.json", (later, later))  # by somebody else
+    assert everything.run_job(job, arguments) is None
+    assert len(commands) == 3
+    os.utime(job.out / "said.json", (later - 200, later - 200))
+    arguments.fresh = True
+    assert everything.run_job(job, arguments) is None
+    assert len(commands) == 4
