@@ -21,7 +21,7 @@ from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.relief import made_deeper
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings
 
-__all__ = ["HoppingParams", "better_basin"]
+__all__ = ["HoppingParams", "better_basin", "cost"]
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def _plausible(points: Float[Tensor, "frames points 3"], params: HoppingParams) 
     return float(points[..., 2].norm()) <= params.deepest * float(points[..., :2].norm())
 
 
-def _cost(views: Views, model: ShapeModel, eps: float, width: float, articulation: ArticulationParams) -> float:
+def cost(views: Views, model: ShapeModel, eps: float, width: float, articulation: ArticulationParams) -> float:
     """Likelihood and term at the last residual, nats a frame, the width being the same for all that are compared."""
     answer = evaluate(views, model, eps)
     rigid = find_partners(answer.points[0], _noise(views), replace(articulation, deviation=width, loosest=width))
@@ -208,7 +208,7 @@ def better_basin(
         else:
             # Costs compare at one width only: the tightest that an answer has shown.
             width = min(width, shown)
-            gain = _cost(some, best, eps, width, articulation) - _cost(some, found, eps, width, articulation)
+            gain = cost(some, best, eps, width, articulation) - cost(some, found, eps, width, articulation)
             if hop == 0 and _change(some, best, found, eps) < params.same:
                 best = found
                 break
@@ -231,5 +231,5 @@ def better_basin(
     )
     if whole is None or _shown(views, whole, eps, params, articulation) is None:
         return model
-    before = _cost(views, model, eps, width, articulation)
-    return whole if _cost(views, whole, eps, width, articulation) < before else model
+    before = cost(views, model, eps, width, articulation)
+    return whole if cost(views, whole, eps, width, articulation) < before else model

@@ -23,7 +23,7 @@ from torchrecon.nrsfm.base import check_size, solve_items, turn_of_view
 from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
-from torchrecon.nrsfm.hopping import HoppingParams, better_basin
+from torchrecon.nrsfm.hopping import HoppingParams, better_basin, cost
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
@@ -206,7 +206,9 @@ def _articulated(
 ) -> tuple[ShapeModel, float, Articulation | None]:
     """The answer, its residual and the pairs that keep their distance; as it was where there are none.
 
-    An exact family, whose residual went on falling, is left where it is unless it breaks its pairs.
+    An exact family, whose residual went on falling, is left where it is unless it breaks its pairs, and even then where
+    its modes are few: that tracks agree with few modes so closely is no accident. What is found instead has to explain
+    the tracks as closely.
     """
     if not model.loadings.shape[-1]:
         return model, eps, None
@@ -218,19 +220,20 @@ def _articulated(
 
     before = share(model, eps)
     believed = max(articulation.believed, articulation.fallen * before)
-    found, level = model, max(eps, params.fine)
-    if eps >= level or before > articulation.believed:
-        pairs = replace(articulation, believed=believed)
+    found, exact = model, eps < params.fine
+    if not exact or before > articulation.believed:
+        if exact and 3 * model.loadings.shape[-1] <= model.mean.shape[-2]:
+            return model, eps, None
+        level, pairs = max(eps, params.fine), replace(articulation, believed=believed)
         found = better_basin(views, model, level, growth, generator, params.hopping, pairs, params.descent)
-    else:
-        level = eps
-    rigid = find_partners(evaluate(views, found, level).points[0], noise, articulation)
+    rigid = find_partners(evaluate(views, found, eps).points[0], noise, articulation)
     if rigid is None:
         return model, eps, None
-    found, _, _ = descend(views, found, level, articulation.steps, params.descent, rigid)
-    if share(found, level) > believed:
-        return model, eps, None
-    return found, level, rigid
+    found, _, _ = descend(views, found, eps, articulation.steps, params.descent, rigid)
+    kept = share(found, eps) <= believed and cost(views, found, eps, rigid.width, articulation) < cost(
+        views, model, eps, rigid.width, articulation
+    )
+    return (found, eps, rigid) if kept else (model, eps, None)
 
 
 def _told_noise(views: Views, params: MarginalParams) -> float:
