@@ -255,7 +255,8 @@ def main(arguments: list[str] | None = None) -> int:
             known = asked = list(SEQUENCES if options.data is not None else ACTIONS[:5])
         for name in options.sequence or asked:
             if name not in known:
-                raise ReconError(f"--sequence {name}: is not one of {', '.join(known[:20])}")
+                more = f" and {len(known) - 20} more" if len(known) > 20 else ""
+                raise ReconError(f"--sequence {name}: is not one of {', '.join(known[:20])}{more}")
             for solver in options.solver:
                 rows.append(measure(name, solver, options))
                 print(table(rows[-1:]).splitlines()[1], file=sys.stderr, flush=True)

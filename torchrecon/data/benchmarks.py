@@ -23,7 +23,7 @@ class Benchmark:
     """One sequence with ground truth.
 
     Attributes:
-        name: one of :data:`SEQUENCES`.
+        name: of the sequence, one of :data:`SEQUENCES` where it was read by :func:`load_benchmark`.
         points3d: (frames, points, 3) truth in camera axes; the orthographic input is its first two coordinates.
         canonical: (frames, points, 3) truth in world axes, in the unit of ``points3d``; None where the files hold
             none.
@@ -62,7 +62,7 @@ def load_benchmark(name: str, folder: str | os.PathLike[str]) -> Benchmark:
     """Read one sequence.
 
     Args:
-        name: one of :data:`SEQUENCES`.
+        name: of the sequence, one of :data:`SEQUENCES` where it was read by :func:`load_benchmark`.
         folder: holds ``camera_frame/NAME_rearranged.mat`` (X, 3 x P x F, camera axes) and, for the Akhter
             sequences, ``akhter/NAME.mat`` (S, 3F x P, world axes).
 

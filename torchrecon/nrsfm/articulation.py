@@ -34,7 +34,8 @@ class ArticulationParams:
         weight: of the term against the likelihood; pairs are many and not independent (no unit).
         judged: deviation at which it is asked whether a body is articulated at all.
         believed: share of what the term can cost there up to which it is.
-        fallen: the same relative to what it was without the term: smooth deformations without parts keep .92 or more.
+        fallen: the same relative to what it was without the term. Six random smooth deformations kept .90 to .99, exact
+            families of few modes .54 to .66: the solver leaves those out.
         steps: quasi-Newton steps with the term (count).
     """
 

@@ -86,7 +86,7 @@ def _annealed(
                 return None
             for _ in range(growth.growths):
                 model = grow_loadings(views, model, residual, growth.modes, growth.noise, growth.draws)
-            rigid = find_partners(evaluate(views, model, residual).points[0], _noise(views), wide)
+            rigid = find_partners(evaluate(views, model, residual).points[0], views.variance, wide)
             model, _, _ = descend(views, model, residual, growth.steps, descent, rigid)
     return model
 
@@ -99,7 +99,7 @@ def _plausible(points: Float[Tensor, "frames points 3"], params: HoppingParams) 
 def cost(views: Views, model: ShapeModel, eps: float, width: float, articulation: ArticulationParams) -> float:
     """Likelihood and term at the last residual, nats a frame, the width being the same for all that are compared."""
     answer = evaluate(views, model, eps)
-    rigid = find_partners(answer.points[0], _noise(views), replace(articulation, deviation=width, loosest=width))
+    rigid = find_partners(answer.points[0], views.variance, replace(articulation, deviation=width, loosest=width))
     assert rigid is not None
     return (float(answer.value) + float(rigid.cost(answer.points))) / model.scale.shape[-1]
 
@@ -111,14 +111,10 @@ def _shown(
     if model is None:
         return None
     points = evaluate(views, model, eps).points[0]
-    if not _plausible(points, params) or broken(points, _noise(views), articulation) > articulation.believed:
+    if not _plausible(points, params) or broken(points, views.variance, articulation) > articulation.believed:
         return None
-    rigid = find_partners(points, _noise(views), articulation)
+    rigid = find_partners(points, views.variance, articulation)
     return None if rigid is None else rigid.width
-
-
-def _noise(views: Views) -> float:
-    return float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
 
 
 def _survey_frames(model: ShapeModel, params: HoppingParams) -> Int[Tensor, " chosen"]:

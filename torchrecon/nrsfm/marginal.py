@@ -212,11 +212,10 @@ def _articulated(
     """
     if not model.loadings.shape[-1]:
         return model, eps, None
-    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
     articulation = params.articulation
 
     def share(model: ShapeModel, eps: float) -> float:
-        return broken(evaluate(views, model, eps).points[0], noise, articulation)
+        return broken(evaluate(views, model, eps).points[0], views.variance, articulation)
 
     before = share(model, eps)
     believed = max(articulation.believed, articulation.fallen * before)
@@ -226,7 +225,7 @@ def _articulated(
             return model, eps, None
         level, pairs = max(eps, params.fine), replace(articulation, believed=believed)
         found = better_basin(views, model, level, growth, generator, params.hopping, pairs, params.descent)
-    rigid = find_partners(evaluate(views, found, eps).points[0], noise, articulation)
+    rigid = find_partners(evaluate(views, found, eps).points[0], views.variance, articulation)
     if rigid is None:
         return model, eps, None
     found, _, _ = descend(views, found, eps, articulation.steps, params.descent, rigid)
@@ -238,7 +237,7 @@ def _articulated(
 
 def _told_noise(views: Views, params: MarginalParams) -> float:
     """Variance of the observations that a mode has to be told from; below the last residual it is a part of that."""
-    noise = float(views.noise.diagonal(dim1=-2, dim2=-1).mean())
+    noise = views.variance
     return noise if noise > params.fine**2 else 0.0
 
 

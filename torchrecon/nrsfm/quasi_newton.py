@@ -28,6 +28,8 @@ class DescentParams:
         tolerance: fall of the value per frame and step at which an item has converged (nats).
         turn: largest turn of a frame in one step (radians).
         halvings: line search trials per step (count).
+        shorter: factor between them, and between the steps that two iterations try first (no unit).
+        least: share of a full step that is tried first at least (no unit).
         sufficient: share of the predicted fall that a step has to bring (no unit).
     """
 
@@ -35,6 +37,8 @@ class DescentParams:
     tolerance: float = 5e-4
     turn: float = 0.4
     halvings: int = 8
+    shorter: float = 0.4
+    least: float = 1e-3
     sufficient: float = 1e-4
 
 
@@ -160,14 +164,14 @@ def descend(
             good = (then.value <= now.value + params.sufficient * length * slope) | (length == 0)
             if bool(good.all()):
                 break
-            length = torch.where(good, length, 0.4 * length)
+            length = torch.where(good, length, params.shorter * length)
         length = torch.where(good, length, torch.zeros_like(length))
         if not bool(good.all()):
             step = scaled(-length, q)
             trial = moved(model, *step)
             then = judged(trial)
         # A step as long as the last one that was accepted, longer where that was so at once.
-        reach = torch.where(length == tried, length / 0.4, length).clamp(1e-3, 1.0)
+        reach = torch.where(length == tried, length / params.shorter, length).clamp(params.least, 1.0)
         change = added(_gradient(then), -torch.ones_like(length), _gradient(now))
         curvature = inner(step, change)
         usable = curvature > 1e-10 * (length * slope).abs()

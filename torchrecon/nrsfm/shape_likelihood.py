@@ -38,6 +38,11 @@ class Views:
     visible: Bool[Tensor, "*b frames points"]
     noise: Float[Tensor, "*b frames points 2 2"]
 
+    @property
+    def variance(self) -> float:
+        """Mean noise variance of a coordinate."""
+        return float(self.noise.diagonal(dim1=-2, dim2=-1).mean())
+
     def whitener(self, residual: Float[Tensor, "*b frames"]) -> Float[Tensor, "*b frames points 2 2"]:
         """K with ``K^T K`` the inverse of noise plus residual; zero where nothing is seen.
 
