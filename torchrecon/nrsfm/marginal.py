@@ -2,9 +2,10 @@
 
 Starts come from metric upgrades with several numbers of bases. From each, the residual of the model falls from coarse
 to fine; at every level one step of expectation-maximisation lets new modes in where the tracks ask for them, and a
-preconditioned quasi-Newton descent follows the likelihood. The likeliest start is carried through. No K is needed: the
-rank that is reported decides only whether the first mode has to prove itself against the noise (K = 1). Complete and
-incomplete tracks, with or without covariance, one objective.
+preconditioned quasi-Newton descent follows the likelihood. The likeliest start is carried through. Where its parts do
+not keep their distances, the residual falls once more from a coarser one, which ends elsewhere, and the better of both
+is kept. No K is needed: the rank that is reported decides only whether the first mode has to prove itself against the
+noise (K = 1). Complete and incomplete tracks, with or without covariance, one objective.
 The model is in ``shape_likelihood``; the search is derived here.
 """
 
@@ -26,7 +27,7 @@ from torchrecon.nrsfm.gram import gram_upgrade
 from torchrecon.nrsfm.hopping import HoppingParams, better_basin, cost
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
-from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
+from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend, residual_levels
 from torchrecon.nrsfm.relief import ReliefParams, other_depth
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, cost_of_modes, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
@@ -48,10 +49,12 @@ class MarginalParams:
         articulation: of the pairs of points that keep their distance.
         hopping: of the search for a basin in which more of them do.
         relief: of the search for a shape of other depth that explains the tracks as well.
-        coarse, fine: first and last standard deviation of the residual.
+        coarse: first standard deviation of the residual; of the next search where the answer of the last one breaks
+            its pairs.
+        trial: residual at which the likeliest start is kept.
+        fine: last residual.
         finest: how far below ``fine`` the residual of exact tracks goes on falling while no new mode appears.
-        levels: number of residual levels, geometric from coarse to fine (count).
-        trial_levels: levels after which the likeliest start is kept (count).
+        fall: of the residual from level to level, about (no unit).
         starts: starts from the metric upgrade, lowest residual first (count).
         gram_bases: numbers of bases for which the upgrade of least trace supplies one more start (count).
         steps: quasi-Newton steps of a round (count).
@@ -72,11 +75,11 @@ class MarginalParams:
     articulation: ArticulationParams = field(default_factory=ArticulationParams)
     hopping: HoppingParams = field(default_factory=HoppingParams)
     relief: ReliefParams = field(default_factory=ReliefParams)
-    coarse: float = 0.1
+    coarse: tuple[float, ...] = (0.1, 0.3)
+    trial: float = 0.07
     fine: float = 0.003
     finest: float = 0.0001
-    levels: int = 8
-    trial_levels: int = 2
+    fall: float = 0.6
     starts: int = 1
     gram_bases: tuple[int, ...] = (2, 3)
     steps: int = 15
@@ -154,7 +157,7 @@ def solve_marginal(
         fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
         # Tracks that show more than one basis have modes: only a body that may be rigid has to prove them.
         draws = 1.0 if views is measured or rank > 1 else float(fixed.noise.mean() / measured.noise.mean())
-        first, eps, starts, converged = _search(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
+        first, eps, starts, converged = _found(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
         growth = Growth(params.modes, _told_noise(fixed, params), draws, params.growths, params.steps)
         model, eps, rigid = _articulated(fixed, first, eps, growth, generator, params)
         if asked:
@@ -219,9 +222,9 @@ def _articulated(
 
     before = share(model, eps)
     believed = max(articulation.believed, articulation.fallen * before)
-    found, exact = model, eps < params.fine
-    if not exact or before > articulation.believed:
-        if exact and 3 * model.loadings.shape[-1] <= model.mean.shape[-2]:
+    found = model
+    if eps >= params.fine or before > articulation.believed:
+        if _simple(model, eps, params):
             return model, eps, None
         level, pairs = max(eps, params.fine), replace(articulation, believed=believed)
         found = better_basin(views, model, level, growth, generator, params.hopping, pairs, params.descent)
@@ -235,16 +238,22 @@ def _articulated(
     return (found, eps, rigid) if kept else (model, eps, None)
 
 
+def _simple(model: ShapeModel, eps: float, params: MarginalParams) -> bool:
+    """A body that does not bend, or an exact family of few modes: that tracks agree with either is no accident."""
+    modes = model.loadings.shape[-1]
+    return not modes or (eps < params.fine and 3 * modes <= model.mean.shape[-2])
+
+
 def _told_noise(views: Views, params: MarginalParams) -> float:
     """Variance of the observations that a mode has to be told from; below the last residual it is a part of that."""
     noise = views.variance
     return noise if noise > params.fine**2 else 0.0
 
 
-def _search(
+def _found(
     views: Views, draws: float, complete: Tensor, generator: torch.Generator, params: MarginalParams
 ) -> tuple[ShapeModel, float, int, bool]:
-    """The likeliest model: from the coarse residual to the fine one, from several starts until one is the likeliest.
+    """The best answer of all searches; one is enough where its body is simple, keeps its distances or has none to keep.
 
     Args:
         draws: share of the observations that are independent of one another.
@@ -258,37 +267,63 @@ def _search(
     starts = [start[2] for start in found[: params.starts]]
     starts += [gram_upgrade(stack, 3 * bases, scaled=False).rotations for bases in params.gram_bases]
     starts += [gram_upgrade(stack, 3, scaled=True).rotations]
-    rotations = torch.stack(starts)
-    model = _rigid_model(complete, rotations)
-    noise = _told_noise(views, params)
-    fall = (params.fine / params.coarse) ** (1 / (params.levels - 1))
-    eps, level, before = params.coarse, 0, -1
+    rotations, pairs = torch.stack(starts), params.articulation
+    answers: list[tuple[ShapeModel, float, bool]] = []
+    for coarse in params.coarse:
+        best = _search(views, draws, _rigid_model(complete, rotations), coarse, params)
+        answers.append(best)
+        points = evaluate(views, best[0], best[1]).points[0]
+        if _simple(best[0], best[1], params) or find_partners(points, views.variance, pairs) is None:
+            break
+        best = min(answers, key=lambda answer: cost(views, answer[0], params.fine, pairs.judged, pairs))
+        if broken(points, views.variance, pairs) <= pairs.believed:
+            break
+    model, eps, converged = best
+    return model, eps, len(rotations) * len(answers), converged
+
+
+def _search(
+    views: Views, draws: float, rigid: ShapeModel, coarse: float, params: MarginalParams
+) -> tuple[ShapeModel, float, bool]:
+    """The likeliest model: from the coarse residual to the fine one, from several starts until one is the likeliest.
+
+    Args:
+        draws: as for :func:`_found`.
+        rigid: the starts, one a batch item.
+        coarse: first residual.
+
+    Returns:
+        model, a batch of one; deviation of its residual; whether the last descent converged.
+    """
+    noise, frames = _told_noise(views, params), rigid.scale.shape[-1]
+    finer = residual_levels(params.fine, params.finest, params.fall)[1:]
+    model, eps, grown = rigid, coarse, True
     value = torch.full_like(model.scale[:, 0], torch.inf)
-    while True:
-        # What the loadings avoid follows the mean shape only in a growth, so the last level grows again and again.
-        for turn in range(params.last_rounds if level == params.levels - 1 else 1):
+    for residual in residual_levels(coarse, params.fine, params.fall) + finer:
+        # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly. Noise
+        # that hides further modes is no such sign.
+        if residual < params.fine and (noise > 0 or grown):
+            break
+        eps, modes = residual, model.loadings.shape[-1]
+        # What the loadings avoid follows the mean shape only in a growth, so the fine level grows again and again.
+        for turn in range(params.last_rounds if eps == params.fine else 1):
             for _ in range(params.growths):
                 model = grow_loadings(views, model, eps, params.modes, noise, draws)
             last = value
             model, value, converged = descend(views, model, eps, params.steps, params.descent)
-            if turn and float((last - value).amax()) < params.settled * len(complete):
+            if turn and float((last - value).amax()) < params.settled * frames:
                 converged = True
                 break
-        if level == params.trial_levels - 1:
+        grown = model.loadings.shape[-1] > modes
+        if len(value) > 1 and eps <= params.trial:
             model = model.pick(int(value.argmin()))
-        # Beyond the fine level only a family that has found all its modes is followed: it is exact, or nearly. Noise
-        # that hides further modes is no such sign.
-        modes = model.loadings.shape[-1]
-        if level >= params.levels - 1 and (noise > 0 or modes > before or eps * fall < params.finest):
-            break
-        eps, level, before = eps * fall, level + 1, modes
     # Modes that come in before the views are right can stand for a turn: a body that does not bend is tried as well.
-    stiff, cost = _rigid_model(complete, rotations), cost_of_modes(views, model)
-    for residual in (params.coarse, eps):
+    stiff, worth = rigid, cost_of_modes(views, model)
+    for residual in (coarse, eps):
         stiff, stiff_value, ended = descend(views, stiff, residual, params.rigid_steps, params.descent)
-        if float(stiff_value.min()) >= float(evaluate(views, model, residual).value) + cost:
-            return model, eps, len(rotations), converged
-    return stiff.pick(int(stiff_value.argmin())), eps, len(rotations), ended
+        if float(stiff_value.min()) >= float(evaluate(views, model, residual).value) + worth:
+            return model, eps, converged
+    return stiff.pick(int(stiff_value.argmin())), eps, ended
 
 
 def _shapeless(data: Observations) -> Status | None:

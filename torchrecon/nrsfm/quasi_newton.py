@@ -7,6 +7,7 @@ curvature pairs and the line search are per item; an item never waits for the li
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from torchrecon._typing import Tensor
 from torchrecon.nrsfm.articulation import Articulation, evaluate_with
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate, moved
 
-__all__ = ["DescentParams", "Direction", "Growth", "added", "descend", "inner", "metric", "scaled"]
+__all__ = ["DescentParams", "Direction", "Growth", "added", "descend", "inner", "metric", "residual_levels", "scaled"]
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,17 @@ class Growth:
 
 
 Direction = tuple[Tensor, Tensor, Tensor]
+
+
+def residual_levels(coarse: float, fine: float, fall: float) -> list[float]:
+    """Standard deviations of the residual from coarse to fine, both included, each about ``fall`` times the last.
+
+    Example:
+        >>> [round(level, 3) for level in residual_levels(0.1, 0.0125, 0.45)]
+        [0.1, 0.05, 0.025, 0.013]
+    """
+    steps = max(1, round(math.log(fine / coarse) / math.log(fall)))
+    return [*(coarse * (fine / coarse) ** (step / steps) for step in range(steps)), fine]
 
 
 def inner(a: Direction, b: Direction) -> Tensor:
