@@ -8,11 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchrecon.data.synthetic import sample_body, sample_motion
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Tracks
 from torchrecon.metrics import error3d_camera
 from torchrecon.nrsfm.articulation import Articulation, ArticulationParams, evaluate_with, find_partners
-from torchrecon.nrsfm.marginal import MarginalParams, solve_marginal
+from torchrecon.nrsfm.marginal import MarginalParams, _found, solve_marginal
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, moved, tangents
 
 
@@ -107,3 +108,26 @@ def test_articulated_body_is_found_better_with_the_term():
     default = MarginalParams()
     without = replace(default, articulation=replace(default.articulation, partners=0))
     assert error(default) < 0.5 * error(without)
+
+
+@pytest.mark.parametrize(("action", "searches", "gain"), [("jump", 2, 0.5), ("idle", 1, 1.0)])
+def test_a_coarser_search_follows_where_the_first_answer_breaks_its_pairs(action, searches, gain):
+    g = torch.Generator().manual_seed(1)
+    joints = sample_motion(action, sample_body(g), frames=90, fps=25.0, generator=g).joints.double()
+    yaw = torch.arange(90, dtype=torch.float64)[:, None] * torch.tensor([0.0, math.radians(5), 0.0])
+    tilt = rotation_from_vector(torch.tensor([0.17, 0.0, 0.0], dtype=torch.float64))
+    truth = (joints - joints.mean(1, keepdim=True)) @ (tilt @ rotation_from_vector(yaw)).mT
+    truth = truth / truth[..., :2].square().mean().sqrt()
+    xy = truth[..., :2]
+    views = Views(xy, torch.ones(90, xy.shape[1], dtype=torch.bool), torch.zeros(*xy.shape, 2, dtype=xy.dtype))
+    default = MarginalParams()
+
+    def found(params: MarginalParams) -> tuple[float, int]:
+        answers, starts = _found(views, 1.0, xy, torch.Generator().manual_seed(0), params)
+        model, eps, _ = answers[0]
+        return float(error3d_camera(evaluate(views, model, eps).points[0], truth)), starts
+
+    once, starts = found(replace(default, coarse=default.coarse[:1]))
+    error, all_starts = found(default)
+    assert all_starts == searches * starts
+    assert error <= gain * once

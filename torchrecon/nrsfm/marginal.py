@@ -3,9 +3,10 @@
 Starts come from metric upgrades with several numbers of bases. From each, the residual of the model falls from coarse
 to fine; at every level one step of expectation-maximisation lets new modes in where the tracks ask for them, and a
 preconditioned quasi-Newton descent follows the likelihood. The likeliest start is carried through. Where its parts do
-not keep their distances, the residual falls once more from a coarser one, which ends elsewhere, and the better of both
-is kept. No K is needed: the rank that is reported decides only whether the first mode has to prove itself against the
-noise (K = 1). Complete and incomplete tracks, with or without covariance, one objective.
+not keep their distances, the residual falls once more from a coarser one, which ends elsewhere; the better of both is
+kept, at once or, where they are close, after the search for articulated parts. No K is needed: the rank that is
+reported decides only whether the first mode has to prove itself against the noise (K = 1). Complete and incomplete
+tracks, with or without covariance, one objective.
 The model is in ``shape_likelihood``; the search is derived here.
 """
 
@@ -51,6 +52,7 @@ class MarginalParams:
         relief: of the search for a shape of other depth that explains the tracks as well.
         coarse: first standard deviation of the residual; of the next search where the answer of the last one breaks
             its pairs.
+        apart: what one answer has to cost more than another not to be followed (nats a frame).
         trial: residual at which the likeliest start is kept.
         fine: last residual.
         finest: how far below ``fine`` the residual of exact tracks goes on falling while no new mode appears.
@@ -76,6 +78,7 @@ class MarginalParams:
     hopping: HoppingParams = field(default_factory=HoppingParams)
     relief: ReliefParams = field(default_factory=ReliefParams)
     coarse: tuple[float, ...] = (0.1, 0.3)
+    apart: float = 5.0
     trial: float = 0.07
     fine: float = 0.003
     finest: float = 0.0001
@@ -91,6 +94,10 @@ class MarginalParams:
     fill_rank: int = 9
     noise_share: float = 0.25
     noise_agrees: float = 2.25
+
+
+_Answer = tuple[ShapeModel, float, bool]
+"""A model, a batch of one; deviation of its residual; whether the last descent to it converged."""
 
 
 def _noise_variance(data: Observations, complete: Float[Tensor, "frames points 2"], params: MarginalParams) -> float:
@@ -157,9 +164,12 @@ def solve_marginal(
         fixed = Views(views.xy.detach(), views.visible, views.noise.detach())
         # Tracks that show more than one basis have modes: only a body that may be rigid has to prove them.
         draws = 1.0 if views is measured or rank > 1 else float(fixed.noise.mean() / measured.noise.mean())
-        first, eps, starts, converged = _found(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
+        answers, starts = _found(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
         growth = Growth(params.modes, _told_noise(fixed, params), draws, params.growths, params.steps)
-        model, eps, rigid = _articulated(fixed, first, eps, growth, generator, params)
+        tried = [_articulated(fixed, answer, growth, generator, params) for answer in answers]
+        best = min(range(len(tried)), key=lambda i: _cost(fixed, tried[i][0], params)) if len(tried) > 1 else 0
+        model, eps, rigid = tried[best]
+        first, _, converged = answers[best]
         if asked:
             model = settled(fixed, model, eps, articulation=rigid)
     if asked:
@@ -205,7 +215,7 @@ def solve_marginal(
 
 
 def _articulated(
-    views: Views, model: ShapeModel, eps: float, growth: Growth, generator: torch.Generator, params: MarginalParams
+    views: Views, answer: _Answer, growth: Growth, generator: torch.Generator, params: MarginalParams
 ) -> tuple[ShapeModel, float, Articulation | None]:
     """The answer, its residual and the pairs that keep their distance; as it was where there are none.
 
@@ -213,6 +223,7 @@ def _articulated(
     its modes are few: that tracks agree with few modes so closely is no accident. What is found instead has to explain
     the tracks as closely.
     """
+    model, eps, _ = answer
     if not model.loadings.shape[-1]:
         return model, eps, None
     articulation = params.articulation
@@ -238,6 +249,11 @@ def _articulated(
     return (found, eps, rigid) if kept else (model, eps, None)
 
 
+def _cost(views: Views, model: ShapeModel, params: MarginalParams) -> float:
+    """What answers are compared by: likelihood and term for articulation at the fine residual, nats a frame."""
+    return cost(views, model, params.fine, params.articulation.judged, params.articulation)
+
+
 def _simple(model: ShapeModel, eps: float, params: MarginalParams) -> bool:
     """A body that does not bend, or an exact family of few modes: that tracks agree with either is no accident."""
     modes = model.loadings.shape[-1]
@@ -252,15 +268,14 @@ def _told_noise(views: Views, params: MarginalParams) -> float:
 
 def _found(
     views: Views, draws: float, complete: Tensor, generator: torch.Generator, params: MarginalParams
-) -> tuple[ShapeModel, float, int, bool]:
-    """The best answer of all searches; one is enough where its body is simple, keeps its distances or has none to keep.
+) -> tuple[list[_Answer], int]:
+    """The answers of all searches between which low rank cannot choose, best first, and the number of starts.
+
+    One search is enough where its body is simple, keeps its distances or has none to keep.
 
     Args:
         draws: share of the observations that are independent of one another.
         complete: (frames, points, 2) centred tracks without gaps, for the starts.
-
-    Returns:
-        model, a batch of one; deviation of its residual; number of starts; whether the last descent converged.
     """
     stack = complete.mT.flatten(0, 1)
     found = sorted(upgraded_rotations(stack, params.upgrade, generator), key=lambda start: start[0])
@@ -268,32 +283,28 @@ def _found(
     starts += [gram_upgrade(stack, 3 * bases, scaled=False).rotations for bases in params.gram_bases]
     starts += [gram_upgrade(stack, 3, scaled=True).rotations]
     rotations, pairs = torch.stack(starts), params.articulation
-    answers: list[tuple[ShapeModel, float, bool]] = []
+    answers: list[_Answer] = []
     for coarse in params.coarse:
-        best = _search(views, draws, _rigid_model(complete, rotations), coarse, params)
-        answers.append(best)
-        points = evaluate(views, best[0], best[1]).points[0]
-        if _simple(best[0], best[1], params) or find_partners(points, views.variance, pairs) is None:
-            break
-        best = min(answers, key=lambda answer: cost(views, answer[0], params.fine, pairs.judged, pairs))
+        model, eps, converged = _search(views, draws, _rigid_model(complete, rotations), coarse, params)
+        points = evaluate(views, model, eps).points[0]
+        if _simple(model, eps, params) or find_partners(points, views.variance, pairs) is None:
+            return [(model, eps, converged)], len(rotations) * (len(answers) + 1)
+        answers.append((model, eps, converged))
         if broken(points, views.variance, pairs) <= pairs.believed:
             break
-    model, eps, converged = best
-    return model, eps, len(rotations) * len(answers), converged
+    costs = [_cost(views, model, params) for model, _, _ in answers]
+    order = sorted(range(len(answers)), key=costs.__getitem__)
+    close = [answers[i] for i in order if costs[i] <= costs[order[0]] + params.apart]
+    return close, len(rotations) * len(answers)
 
 
-def _search(
-    views: Views, draws: float, rigid: ShapeModel, coarse: float, params: MarginalParams
-) -> tuple[ShapeModel, float, bool]:
+def _search(views: Views, draws: float, rigid: ShapeModel, coarse: float, params: MarginalParams) -> _Answer:
     """The likeliest model: from the coarse residual to the fine one, from several starts until one is the likeliest.
 
     Args:
         draws: as for :func:`_found`.
         rigid: the starts, one a batch item.
         coarse: first residual.
-
-    Returns:
-        model, a batch of one; deviation of its residual; whether the last descent converged.
     """
     noise, frames = _told_noise(views, params), rigid.scale.shape[-1]
     finer = residual_levels(params.fine, params.finest, params.fall)[1:]
