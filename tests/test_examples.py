@@ -30,14 +30,14 @@ def load(name: str) -> ModuleType:
 
 
 def test_quickstart_writes_a_shape_near_the_truth_and_its_files(tmp_path, capsys):
-    rec = load("quickstart").main(tmp_path, frames=24, points=16)
+    rec = load("quickstart").main(tmp_path, frames=40, points=16)
     said = capsys.readouterr().out
     # A flat shape, depth zero, scores 0.5 here and more.
     assert float(said.split("truth: ")[1].split()[0]) < 0.25
     assert said.startswith("ok: ")
     assert {path.name for path in tmp_path.iterdir()} == {"tracks.npz", "shape.npz", "shape.glb", "shape.csv"}
     rows = np.loadtxt(tmp_path / "shape.csv", delimiter=",", skiprows=1, usecols=(3, 4, 5))
-    np.testing.assert_allclose(rows.reshape(24, 16, 3), rec.points3d, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(rows.reshape(40, 16, 3), rec.points3d, rtol=1e-5, atol=1e-5)
 
 
 def test_own_video_makes_a_page_and_explains_the_tracks(tmp_path, capsys):

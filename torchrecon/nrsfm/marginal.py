@@ -78,7 +78,7 @@ class MarginalParams:
     hopping: HoppingParams = field(default_factory=HoppingParams)
     relief: ReliefParams = field(default_factory=ReliefParams)
     coarse: tuple[float, ...] = (0.1, 0.3)
-    apart: float = 5.0
+    apart: float = 3.0
     trial: float = 0.07
     fine: float = 0.003
     finest: float = 0.0001
