@@ -1,4 +1,4 @@
-"""Joints of captured everyday motion before a turning camera: sequences that the solver was not made on."""
+"""Joints of captured everyday motion before a turning camera: far more sequences than the solver was made on."""
 
 from __future__ import annotations
 

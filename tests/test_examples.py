@@ -33,7 +33,7 @@ def test_quickstart_writes_a_shape_near_the_truth_and_its_files(tmp_path, capsys
     rec = load("quickstart").main(tmp_path, frames=40, points=16)
     said = capsys.readouterr().out
     # A flat shape, depth zero, scores 0.5 here and more.
-    assert float(said.split("truth: ")[1].split()[0]) < 0.25
+    assert float(said.split("truth: ")[1].split()[0]) < 0.15
     assert said.startswith("ok: ")
     assert {path.name for path in tmp_path.iterdir()} == {"tracks.npz", "shape.npz", "shape.glb", "shape.csv"}
     rows = np.loadtxt(tmp_path / "shape.csv", delimiter=",", skiprows=1, usecols=(3, 4, 5))
