@@ -32,7 +32,7 @@ from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend, residu
 from torchrecon.nrsfm.relief import ReliefParams, other_depth
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, cost_of_modes, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
-from torchrecon.nrsfm.spread import SpreadParams, halved, posterior_covariance, refitted, widened
+from torchrecon.nrsfm.spread import SpreadParams, halved, posterior_covariance, refitted, unmodelled, widened
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
@@ -185,6 +185,9 @@ def solve_marginal(
     if params.spread.halves:
         errors = halved(fixed, model, answer, eps, generator, params.spread, params.descent)
         covariance = widened(covariance, errors, params.spread.window)
+    predicted = (answer.points[0][..., :2] + answer.translation[0][:, None]).detach()
+    lacking = unmodelled(measured.xy.detach(), measured.visible, predicted)
+    covariance = covariance + lacking * torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     doubt = None
     turn = float(turn_of_view(model.rotations[0].detach()))
     if turn < params.relief.turn:

@@ -10,6 +10,8 @@ neighbours, and deformation that the model lacks pulls the halves apart.
 Both follow the likelihood alone, without the term for articulation: they show what the tracks leave open.
 A few refits do not give a covariance per point, but they tell well by how much the closed form is too small: per axis
 of the whitened errors, per frame and per point. No refit leaves the basin of the answer.
+Deformation too weak to stand above the noise is in none of the refits. It is in the residual of the tracks: noise is
+drawn anew in every frame, deformation is not.
 """
 
 from __future__ import annotations
@@ -19,12 +21,12 @@ from dataclasses import dataclass, fields
 
 import torch
 
-from torchrecon._typing import Float, Tensor
+from torchrecon._typing import Bool, Float, Tensor
 from torchrecon.linalg import skew
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate
 
-__all__ = ["SpreadParams", "halved", "posterior_covariance", "refitted", "widened"]
+__all__ = ["SpreadParams", "halved", "posterior_covariance", "refitted", "unmodelled", "widened"]
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,35 @@ def halved(
     kept = torch.where(kept.sum(-1, keepdim=True) < params.least, views.visible, kept)
     some = Views(views.xy.expand(params.halves, -1, -1, -1), kept, views.noise.expand(params.halves, -1, -1, -1, -1))
     return _errors(some, views, model, answer, eps, params.half_steps, descent)
+
+
+def unmodelled(
+    xy: Float[Tensor, "frames points 2"],
+    visible: Bool[Tensor, "frames points"],
+    predicted: Float[Tensor, "frames points 2"],
+) -> Float[Tensor, ""]:
+    """Variance per axis of the motion that the answer lacks: that of the part of the residual that lasts.
+
+    The autocovariance of the residual at lag 0 without the noise, which has none at others, drawn out from lags 1 and 2
+    on a straight line; zero where they leave nothing.
+
+    Example:
+        >>> import torch
+        >>> g = torch.Generator().manual_seed(0)
+        >>> noise = torch.randn(400, 30, 2, generator=g)
+        >>> sway = 0.5 * torch.sin(torch.arange(400) / 9)[:, None, None].expand(400, 30, 2)
+        >>> seen = torch.ones(400, 30, dtype=torch.bool)
+        >>> still = torch.zeros_like(sway)
+        >>> [round(float(unmodelled(noise + motion, seen, still)), 2) for motion in (still, sway)]
+        [0.0, 0.13]
+    """
+    rest = torch.where(visible[..., None], xy - predicted, xy.new_zeros(()))
+
+    def lagged(lag: int) -> Tensor:
+        pairs = 2 * (visible[lag:] & visible[:-lag]).sum()
+        return (rest[lag:] * rest[:-lag]).sum() / pairs.clamp_min(1)
+
+    return (2 * lagged(1) - lagged(2)).clamp_min(0)
 
 
 def _average(values: Float[Tensor, "frames kinds"], half: int) -> Float[Tensor, "frames kinds"]:
