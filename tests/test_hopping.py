@@ -10,7 +10,7 @@ import torch
 from torchrecon.linalg import rotation_angle, rotation_from_vector
 from torchrecon.measurement import Tracks
 from torchrecon.nrsfm.articulation import ArticulationParams
-from torchrecon.nrsfm.hopping import HoppingParams, _part, _survey_frames, _whole, better_basin
+from torchrecon.nrsfm.hopping import HoppingParams, _survey_frames, _whole, better_basin, part_of
 from torchrecon.nrsfm.marginal import MarginalParams, solve_marginal
 from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, tangents
@@ -35,7 +35,7 @@ def test_survey_takes_frames_that_are_close_in_view_and_brings_the_model_back():
     assert 60 <= len(index) < 400
     chosen = rotations[index]
     assert float(rotation_angle(chosen[1:] @ chosen[:-1].mT).max()) <= math.radians(30)
-    some, part = _part(views, model, index)
+    some, part = part_of(views, model, index)
     assert some.xy.shape[0] == part.scale.shape[1] == len(index)
     whole = _whole(part, index, 400)
     torch.testing.assert_close(
@@ -52,7 +52,7 @@ def test_loadings_beyond_all_reason_cost_without_limit_and_the_descent_turns_bac
     assert bool(value.isfinite().all() and found.loadings.isfinite().all())
     growth = Growth(10, 0.0, 1.0, 2, 5)
     deep = replace(model, mean=model.mean * torch.tensor([1.0, 1.0, 1e3]))
-    kept = better_basin(
+    kept, _ = better_basin(
         views, deep, 0.003, growth, torch.Generator(), HoppingParams(), ArticulationParams(), DescentParams()
     )
     assert kept is deep

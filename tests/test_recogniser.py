@@ -29,6 +29,7 @@ from torchrecon.models.recogniser import (
 )
 from torchrecon.models.views import settle
 from train.films import AS_TRACKED, MOCAP_CLASSES, Film, augment, mocap_film
+from train.recogniser import Training
 
 ROOT = Path(__file__).parents[1]
 VIEWS = ReadOut()
@@ -286,7 +287,25 @@ def test_a_distractor_without_clips_is_performed_by_the_synthetic_world(generato
     made = mocap_film(label, clips, 60)
     assert made.label == label
     assert len(made.points3d) == 60  # the synthetic world's own length, not that of a clip
-    assert len(mocap_film(label + 1, clips, 60).points3d) < 60
+    assert len(mocap_film(label + 1, clips, 60).points3d) < 60  # walking, which the synthetic world cannot
+
+
+def test_every_other_film_of_real_motion_is_synthetic(generator):
+    body = sample_body(generator)
+    motion = sample_motion("run", body, frames=40, generator=generator)
+    clip = MocapClip(motion.joints, motion.parents, motion.names, 30.0, "run")
+    clips = {name: [clip] for name in MOCAP_CLASSES}
+    run, walk = MOCAP_CLASSES.index("run"), MOCAP_CLASSES.index("walk")
+    lengths = [[len(mocap_film(6 * turn + label, clips, 60).points3d) for turn in range(4)] for label in (run, walk)]
+    assert lengths == [[60, 40, 60, 40], [40] * 4]
+
+
+def test_only_clear_evidence_speaks_for_a_distractor():
+    training = Training(("run", "dribble"), ReadOut(), distractor_prior=0.1)
+    before = training.recogniser.to_classes.bias.detach().clone()
+    after = training.trained().to_classes.bias
+    change = torch.tensor([0.0, math.log(0.1), math.log(0.1)])  # run, dribble, flat
+    torch.testing.assert_close(after - before, change, rtol=0, atol=1e-6)
 
 
 def test_training_job_that_is_killed_goes_on_and_does_nothing_twice(tmp_path):

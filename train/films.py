@@ -154,17 +154,19 @@ def film_of(body: Body, motion: Motion, label: int, points: int, turn: float | N
 def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Film:
     """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 6]``.
 
-    A class without clips is performed by the synthetic world.
+    Every other film of what the synthetic world can perform is its own: a few people show an action in a few ways. A
+    class without clips is performed by it alone.
     """
     g = torch.Generator().manual_seed(seed)
-    label = seed % len(MOCAP_CLASSES)
-    of_class = clips[MOCAP_CLASSES[label]]
+    turn, label = divmod(seed, len(MOCAP_CLASSES))
+    name = MOCAP_CLASSES[label]
+    of_class = clips[name]
     body = sample_body(g)
-    if of_class:
-        clip = of_class[seed // len(MOCAP_CLASSES) % len(of_class)]
+    if of_class and (name not in ACTIONS or turn % 2):
+        clip = of_class[turn // (1 + (name in ACTIONS)) % len(of_class)]
         motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
     else:
-        motion = sample_motion(MOCAP_CLASSES[label], body, generator=g)
+        motion = sample_motion(name, body, generator=g)
     return film_of(body, motion, label, points, None, g)
 
 

@@ -117,13 +117,13 @@ class Films(L.LightningDataModule):
         if strange:
             raise ReconError(f"{self.file}: has no subject {sorted(strange)[0]!r}; exclude names subjects of the file")
         for clip in known:
-            if clip.subject not in self.exclude and len(clip) >= clip.fps:
+            if clip.subject not in self.exclude and 2 * len(clip) >= clip.fps:
                 clips[clip.label].append(clip)
         empty = [name for name, of_class in clips.items() if not of_class]
         if set(empty) - {"dribble"}:
-            raise ReconError(f"{self.file}: no clip of {', '.join(empty)} of 1 s or more is left to train on")
+            raise ReconError(f"{self.file}: no clip of {', '.join(empty)} of 0.5 s or more is left to train on")
         if empty:  # a distractor, not one of the actions that are scored
-            print(f"{self.file}: no clip of dribble of 1 s or more is left to train on; synthetic ones stand in")
+            print(f"{self.file}: no clip of dribble of 0.5 s or more is left to train on; synthetic ones stand in")
         return partial(mocap_film, clips=clips, points=self.points)
 
     def validation(self, turn: float, what: str) -> tuple[list[Film], list[str] | None]:
@@ -170,8 +170,9 @@ class Training(L.LightningModule):
         width: channels of the first layer.
         learning_rate: peak of the one-cycle schedule.
         weight_decay: of AdamW.
-        flat_prior: how probable the class ``flat`` is a priori against each of the others once training is over. Real
-            tracks show less of a body than training films do, and so look a little flat: only clear evidence counts.
+        distractor_prior: how probable each class that is no action of the paper is a priori against each of those that
+            are, once training is over. Such classes are there for clear evidence only: real tracks show less of a body
+            than training films do, and so look a little flat, and a person never seen may stand a little as if walking.
     """
 
     def __init__(
@@ -181,18 +182,19 @@ class Training(L.LightningModule):
         width: int = 16,
         learning_rate: float = 3e-3,
         weight_decay: float = 1e-2,
-        flat_prior: float = 0.1,
+        distractor_prior: float = 0.1,
     ) -> None:
         super().__init__()
         extra = () if read_out.views == ("camera",) else (FLAT_CLASS,)
         self.recogniser = Recogniser((*classes, *extra), read_out, width)
-        self.learning_rate, self.weight_decay, self.flat_prior = learning_rate, weight_decay, flat_prior
+        self.learning_rate, self.weight_decay, self.distractor_prior = learning_rate, weight_decay, distractor_prior
 
     @torch.no_grad()
     def trained(self) -> Recogniser:
-        """The recogniser in evaluation mode, its classes equally probable in training, with ``flat_prior``."""
-        if FLAT_CLASS in self.recogniser.classes:
-            self.recogniser.to_classes.bias[self.recogniser.classes.index(FLAT_CLASS)] += math.log(self.flat_prior)
+        """The recogniser in evaluation mode, its classes equally probable in training, with ``distractor_prior``."""
+        for index, name in enumerate(self.recogniser.classes):
+            if name not in ASKED:
+                self.recogniser.to_classes.bias[index] += math.log(self.distractor_prior)
         return self.recogniser.eval()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ with moves derived here. It goes over a part of the frames; the winner is then b
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 
@@ -21,7 +22,7 @@ from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend
 from torchrecon.nrsfm.relief import made_deeper
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, evaluate, grow_loadings
 
-__all__ = ["HoppingParams", "better_basin", "cost"]
+__all__ = ["Basin", "HoppingParams", "better_basin", "cost", "part_of"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,18 @@ class HoppingParams:
     wobble: float = 0.15
     knots: int = 12
     deepest: float = 2.0
+
+
+class Basin(NamedTuple):
+    """An answer that a hop has ended at.
+
+    Attributes:
+        model: a batch of one, of some frames.
+        frames: (chosen,) their indices.
+    """
+
+    model: ShapeModel
+    frames: Int[Tensor, " chosen"]
 
 
 def _annealed(
@@ -129,7 +142,7 @@ def _survey_frames(model: ShapeModel, params: HoppingParams) -> Int[Tensor, " ch
     return torch.arange(0, frames, step, device=model.scale.device)
 
 
-def _part(views: Views, model: ShapeModel, index: Tensor) -> tuple[Views, ShapeModel]:
+def part_of(views: Views, model: ShapeModel, index: Int[Tensor, " chosen"]) -> tuple[Views, ShapeModel]:
     """Some frames of observations and model."""
     scale = model.scale[:, index]
     scale = scale / scale.log().mean().exp()
@@ -173,24 +186,26 @@ def better_basin(
     params: HoppingParams,
     articulation: ArticulationParams,
     descent: DescentParams,
-) -> ShapeModel:
+) -> tuple[ShapeModel, list[Basin]]:
     """The likeliest of the model and what hops from it lead to; likelihood and term for articulation together.
 
     The first hop, from the model as it is, ends the search where it comes back to it, and where it shows no parts that
-    keep their distances. The model itself where the view of what was found hardly turns.
+    keep their distances. The model itself where the view of what was found hardly turns. Second, all articulated
+    answers that hops have ended at.
 
     Args:
         model: a batch of one, with modes.
         eps: standard deviation of its residual.
     """
     index = _survey_frames(model, params)
-    some, best = _part(views, model, index)
+    some, best = part_of(views, model, index)
     moves = (
         lambda start: start,
         lambda start: made_deeper(start, 1 / params.factor),
         lambda start: made_deeper(start, params.factor),
         lambda start: _wobbled(start, params, generator),
     )
+    basins: list[Basin] = []
     width, vain = articulation.loosest, 0
     for hop in range(params.hops):
         found = _annealed(
@@ -199,9 +214,10 @@ def better_basin(
         shown = _shown(some, found, eps, params, articulation)
         if found is None or shown is None:
             if hop == 0:
-                return model
+                return model, basins
             vain += 1
         else:
+            basins.append(Basin(found, index))
             # Costs compare at one width only: the tightest that an answer has shown.
             width = min(width, shown)
             gain = cost(some, best, eps, width, articulation) - cost(some, found, eps, width, articulation)
@@ -214,7 +230,7 @@ def better_basin(
         if vain == params.patience:
             break
     if float(turn_of_view(best.rotations[0])) < params.view:
-        return model
+        return model, basins
     whole = _annealed(
         views,
         _whole(best, index, model.scale.shape[-1]),
@@ -226,6 +242,6 @@ def better_basin(
         descent,
     )
     if whole is None or _shown(views, whole, eps, params, articulation) is None:
-        return model
+        return model, basins
     before = cost(views, model, eps, width, articulation)
-    return whole if cost(views, whole, eps, width, articulation) < before else model
+    return whole if cost(views, whole, eps, width, articulation) < before else model, basins

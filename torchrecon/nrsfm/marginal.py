@@ -25,14 +25,22 @@ from torchrecon.nrsfm.base import check_size, solve_items, turn_of_view
 from torchrecon.nrsfm.bridging import bridging
 from torchrecon.nrsfm.common import conclude, filled
 from torchrecon.nrsfm.gram import gram_upgrade
-from torchrecon.nrsfm.hopping import HoppingParams, better_basin, cost
+from torchrecon.nrsfm.hopping import Basin, HoppingParams, better_basin, cost, part_of
 from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend, residual_levels
 from torchrecon.nrsfm.relief import ReliefParams, other_depth
 from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, cost_of_modes, evaluate, grow_loadings, tangents
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
-from torchrecon.nrsfm.spread import SpreadParams, halved, posterior_covariance, refitted, unmodelled, widened
+from torchrecon.nrsfm.spread import (
+    SpreadParams,
+    between,
+    halved,
+    posterior_covariance,
+    refitted,
+    unmodelled,
+    widened,
+)
 from torchrecon.nrsfm.upgrade import UpgradeParams, upgraded_rotations
 
 __all__ = ["MarginalParams", "marginal", "solve_marginal"]
@@ -167,9 +175,12 @@ def solve_marginal(
         answers, starts = _found(fixed, draws, (complete - centre[:, None]).detach(), generator, params)
         growth = Growth(params.modes, _told_noise(fixed, params), draws, params.growths, params.steps)
         tried = [_articulated(fixed, answer, growth, generator, params) for answer in answers]
-        best = min(range(len(tried)), key=lambda i: _cost(fixed, tried[i][0], params)) if len(tried) > 1 else 0
-        model, eps, rigid = tried[best]
+        best = min(range(len(tried)), key=lambda i: _cost(fixed, tried[i][0][0], params)) if len(tried) > 1 else 0
+        model, eps, rigid = tried[best][0]
         first, _, converged = answers[best]
+        every = torch.arange(len(fixed.xy), device=fixed.xy.device)
+        basins = [basin for _, hopped in tried for basin in hopped]
+        basins += [Basin(other[0], every) for i, (other, _) in enumerate(tried) if i != best]
         if asked:
             model = settled(fixed, model, eps, articulation=rigid)
     if asked:
@@ -188,6 +199,10 @@ def solve_marginal(
     predicted = (answer.points[0][..., :2] + answer.translation[0][:, None]).detach()
     lacking = unmodelled(measured.xy.detach(), measured.visible, predicted)
     covariance = covariance + lacking * torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    others = _others(fixed, model, eps, basins, params)
+    covariance = covariance + between(
+        answer.points[0].detach(), model.rotations[0].detach(), others, params.spread.temper
+    )
     doubt = None
     turn = float(turn_of_view(model.rotations[0].detach()))
     if turn < params.relief.turn:
@@ -219,8 +234,10 @@ def solve_marginal(
 
 def _articulated(
     views: Views, answer: _Answer, growth: Growth, generator: torch.Generator, params: MarginalParams
-) -> tuple[ShapeModel, float, Articulation | None]:
+) -> tuple[tuple[ShapeModel, float, Articulation | None], list[Basin]]:
     """The answer, its residual and the pairs that keep their distance; as it was where there are none.
+
+    Second, the answers that the search has come upon, the first one among them where it was left.
 
     An exact family, whose residual went on falling, is left where it is unless it breaks its pairs, and even then where
     its modes are few: that tracks agree with few modes so closely is no accident. What is found instead has to explain
@@ -228,7 +245,7 @@ def _articulated(
     """
     model, eps, _ = answer
     if not model.loadings.shape[-1]:
-        return model, eps, None
+        return (model, eps, None), []
     articulation = params.articulation
 
     def share(model: ShapeModel, eps: float) -> float:
@@ -236,20 +253,36 @@ def _articulated(
 
     before = share(model, eps)
     believed = max(articulation.believed, articulation.fallen * before)
-    found = model
+    found, basins = model, list[Basin]()
     if eps >= params.fine or before > articulation.believed:
         if _simple(model, eps, params):
-            return model, eps, None
+            return (model, eps, None), []
         level, pairs = max(eps, params.fine), replace(articulation, believed=believed)
-        found = better_basin(views, model, level, growth, generator, params.hopping, pairs, params.descent)
+        found, basins = better_basin(views, model, level, growth, generator, params.hopping, pairs, params.descent)
     rigid = find_partners(evaluate(views, found, eps).points[0], views.variance, articulation)
     if rigid is None:
-        return model, eps, None
+        return (model, eps, None), []
     found, _, _ = descend(views, found, eps, articulation.steps, params.descent, rigid)
     kept = share(found, eps) <= believed and cost(views, found, eps, rigid.width, articulation) < cost(
         views, model, eps, rigid.width, articulation
     )
-    return (found, eps, rigid) if kept else (model, eps, None)
+    if not kept:
+        return (model, eps, None), basins
+    every = torch.arange(model.scale.shape[-1], device=model.scale.device)
+    return (found, eps, rigid), [*basins, Basin(model, every)]
+
+
+@torch.no_grad()
+def _others(
+    views: Views, model: ShapeModel, eps: float, basins: list[Basin], params: MarginalParams
+) -> list[tuple[Tensor, Tensor, float]]:
+    """What other answers say of the points, in which frames, and what each costs more than the model there."""
+    others = []
+    for other, frames in basins:
+        some, part = part_of(views, model, frames)
+        points = evaluate(some, other, max(eps, params.fine)).points[0]
+        others.append((points, frames, _cost(some, other, params) - _cost(some, part, params)))
+    return others
 
 
 def _cost(views: Views, model: ShapeModel, params: MarginalParams) -> float:

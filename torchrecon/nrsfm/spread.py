@@ -9,24 +9,26 @@ what exact tracks leave open too: a likelihood as flat as that of bending bodies
 neighbours, and deformation that the model lacks pulls the halves apart.
 Both follow the likelihood alone, without the term for articulation: they show what the tracks leave open.
 A few refits do not give a covariance per point, but they tell well by how much the closed form is too small: per axis
-of the whitened errors, per frame and per point. No refit leaves the basin of the answer.
+of the whitened errors, per frame and per point. No refit leaves the basin of the answer; the other basins that the
+search has come upon say how far that may be off.
 Deformation too weak to stand above the noise is in none of the refits. It is in the residual of the tracks: noise is
 drawn anew in every frame, deformation is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
 
 from torchrecon._typing import Bool, Float, Tensor
-from torchrecon.linalg import skew
+from torchrecon.linalg import interpolated, skew
 from torchrecon.nrsfm.quasi_newton import DescentParams, descend
 from torchrecon.nrsfm.shape_likelihood import Evaluation, ShapeModel, Views, evaluate
 
-__all__ = ["SpreadParams", "halved", "posterior_covariance", "refitted", "unmodelled", "widened"]
+__all__ = ["SpreadParams", "between", "halved", "posterior_covariance", "refitted", "unmodelled", "widened"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class SpreadParams:
         stretches: for which a sequence hides each point, or not, in turn (count).
         least: points of a frame below which it keeps all it has (count).
         window: half-width of the average over frames of a frame's factor (frames).
+        temper: what another answer costs more where it counts by 1/e (nats a frame). Far more than one in all: by how
+            much the likelihood of a family that is not quite true tells basins apart is not known from itself.
     """
 
     draws: int = 4
@@ -50,6 +54,7 @@ class SpreadParams:
     stretches: int = 6
     least: int = 8
     window: int = 4
+    temper: float = 3.0
 
 
 def posterior_covariance(
@@ -179,6 +184,45 @@ def unmodelled(
         return (rest[lag:] * rest[:-lag]).sum() / pairs.clamp_min(1)
 
     return (2 * lagged(1) - lagged(2)).clamp_min(0)
+
+
+def between(
+    points: Float[Tensor, "frames points 3"],
+    rotations: Float[Tensor, "frames 3 3"],
+    others: Sequence[tuple[Tensor, Tensor, float]],
+    temper: float,
+) -> Float[Tensor, "frames points 3 3"]:
+    """Second moment about an answer of the others, each by what it costs more; in camera axes.
+
+    Args:
+        points, rotations: of the answer, camera axes.
+        others: of each the points (chosen, points, 3), their frames (chosen,) and what it costs more (nats a frame).
+        temper: as in the parameters.
+
+    Example:
+        >>> import torch
+        >>> points = torch.randn(4, 5, 3, generator=torch.Generator().manual_seed(0))
+        >>> away = torch.zeros(4, 5, 3)
+        >>> away[:, 0, 2], away[:, 1, 2] = 1.0, -1.0
+        >>> eye = torch.eye(3).expand(4, 3, 3)
+        >>> moment = between(points, eye, [(points + away, torch.arange(4), 0.0)], 1.0)  # half the weight is its own
+        >>> [round(value, 6) for value in moment[0, :, 2, 2].tolist()]
+        [0.5, 0.5, 0.0, 0.0, 0.0]
+    """
+    moment = points.new_zeros(*points.shape, 3)
+    total, flip = 1.0, points.new_tensor([1.0, 1.0, -1.0])
+    for shown, frames, excess in others:
+        weight = math.exp(-max(excess, 0.0) / temper)
+        here, there = (part - part.mean(-2, keepdim=True) for part in (points[frames], shown))
+        away = min(there - here, flip * there - here, key=torch.Tensor.norm)
+        known = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        known[frames] = True
+        # In the body's own axes, in which it changes more slowly than the view.
+        body = torch.zeros_like(points).index_copy(0, frames, away @ rotations[frames])
+        away = interpolated(body, known) @ rotations.mT
+        moment = moment + weight * away[..., :, None] * away[..., None, :]
+        total += weight
+    return moment / total
 
 
 def _average(values: Float[Tensor, "frames kinds"], half: int) -> Float[Tensor, "frames kinds"]:
