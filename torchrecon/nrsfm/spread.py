@@ -54,7 +54,7 @@ class SpreadParams:
     stretches: int = 6
     least: int = 8
     window: int = 4
-    temper: float = 3.0
+    temper: float = 10.0
 
 
 def posterior_covariance(
