@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -10,7 +12,7 @@ from eval.reliability.world import low_rank_tracks
 from torchrecon.linalg import rotation_from_vector
 from torchrecon.measurement import Tracks
 from torchrecon.nrsfm.marginal import MarginalParams, solve_marginal
-from torchrecon.nrsfm.spread import SpreadParams, widened
+from torchrecon.nrsfm.spread import SpreadParams, between, widened
 
 
 def _errors(spread: torch.Tensor, draws: int, seed: int = 0) -> torch.Tensor:
@@ -83,3 +85,23 @@ def test_deformation_too_weak_for_a_mode_is_in_the_covariance() -> None:
     distances = squared_distances(answer.points3d, answer.covariance3d, truth)
     # without what lasts of the residual it is 0.19
     assert 0.93 < float((distances < LEVELS[0.95]).double().mean()) < 0.99
+
+
+def test_other_answers_spread_as_far_as_they_are_off_and_cheap() -> None:
+    g = torch.Generator().manual_seed(0)
+    turns = torch.linspace(0, 3, 60)[:, None] * torch.tensor([0.1, 1.0, 0.0])
+    rotations = rotation_from_vector(turns)
+    body, wrong = torch.randn(12, 3, generator=g), 0.1 * torch.randn(12, 3, generator=g)
+    body, wrong = body - body.mean(0), wrong - wrong.mean(0)
+    points, other = body @ rotations.mT, (body + wrong) @ rotations.mT
+    every, some = torch.arange(60), torch.arange(0, 60, 6)
+    mirrored = points * torch.tensor([1.0, 1.0, -1.0])  # the depth sign is free: that is the same answer
+    assert float(between(points, rotations, [(mirrored, every, 0.0)], 1.0).abs().max()) < 1e-12
+    whole = between(points, rotations, [(other, every, 0.0)], 1.0)
+    away = wrong @ rotations.mT
+    torch.testing.assert_close(whole, 0.5 * away[..., :, None] * away[..., None, :])
+    # what is constant in the body is known between the frames of a part, from the first to the last of them
+    part = between(points, rotations, [(other[some], some, 0.0)], 1.0)
+    torch.testing.assert_close(part[:55], whole[:55])
+    dear = between(points, rotations, [(other, every, 1.0)], 1.0)
+    torch.testing.assert_close(dear, whole * 2 / (1 + math.e))

@@ -188,14 +188,15 @@ def solve_marginal(
     answer = evaluate(views, model, eps, with_spread=True)
     assert answer.spread is not None
     covariance = posterior_covariance(views, model, answer, eps)
+    errors = []
     # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
     if params.spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
         smooth = partial(smoothed, params=params.smoothing)
-        errors = refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)
-        covariance = widened(covariance, errors, params.spread.window)
+        errors += [refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)]
     if params.spread.halves:
-        errors = halved(fixed, model, answer, eps, generator, params.spread, params.descent)
-        covariance = widened(covariance, errors, params.spread.window)
+        errors += [halved(fixed, model, answer, eps, generator, params.spread, params.descent)]
+    if errors:
+        covariance = widened(covariance, torch.cat(errors), params.spread.window)
     predicted = (answer.points[0][..., :2] + answer.translation[0][:, None]).detach()
     lacking = unmodelled(measured.xy.detach(), measured.visible, predicted)
     covariance = covariance + lacking * torch.eye(3, dtype=covariance.dtype, device=covariance.device)
