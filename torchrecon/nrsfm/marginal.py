@@ -30,7 +30,15 @@ from torchrecon.nrsfm.implicit import attached, settled
 from torchrecon.nrsfm.observations import Observations, observe
 from torchrecon.nrsfm.quasi_newton import DescentParams, Growth, descend, residual_levels
 from torchrecon.nrsfm.relief import ReliefParams, other_depth
-from torchrecon.nrsfm.shape_likelihood import ShapeModel, Views, cost_of_modes, evaluate, grow_loadings, tangents
+from torchrecon.nrsfm.shape_likelihood import (
+    Evaluation,
+    ShapeModel,
+    Views,
+    cost_of_modes,
+    evaluate,
+    grow_loadings,
+    tangents,
+)
 from torchrecon.nrsfm.smoothing import SmoothingParams, smoothed
 from torchrecon.nrsfm.spread import (
     SpreadParams,
@@ -187,23 +195,7 @@ def solve_marginal(
         model = attached(views, model, eps, articulation=rigid)
     answer = evaluate(views, model, eps, with_spread=True)
     assert answer.spread is not None
-    covariance = posterior_covariance(views, model, answer, eps)
-    errors = []
-    # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
-    if params.spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
-        smooth = partial(smoothed, params=params.smoothing)
-        errors += [refitted(measured, smooth, model, answer, eps, generator, params.spread, params.descent)]
-    if params.spread.halves:
-        errors += [halved(fixed, model, answer, eps, generator, params.spread, params.descent)]
-    if errors:
-        covariance = widened(covariance, torch.cat(errors), params.spread.window)
-    predicted = (answer.points[0][..., :2] + answer.translation[0][:, None]).detach()
-    lacking = unmodelled(measured.xy.detach(), measured.visible, predicted)
-    covariance = covariance + lacking * torch.eye(3, dtype=covariance.dtype, device=covariance.device)
-    others = _others(fixed, model, eps, basins, params)
-    covariance = covariance + between(
-        answer.points[0].detach(), model.rotations[0].detach(), others, params.spread.temper
-    )
+    covariance = _covariance(measured, views, model, answer, eps, basins, generator, params)
     doubt = None
     turn = float(turn_of_view(model.rotations[0].detach()))
     if turn < params.relief.turn:
@@ -273,17 +265,45 @@ def _articulated(
     return (found, eps, rigid), [*basins, Basin(model, every)]
 
 
-@torch.no_grad()
-def _others(
-    views: Views, model: ShapeModel, eps: float, basins: list[Basin], params: MarginalParams
-) -> list[tuple[Tensor, Tensor, float]]:
-    """What other answers say of the points, in which frames, and what each costs more than the model there."""
+def _covariance(
+    measured: Views,
+    views: Views,
+    model: ShapeModel,
+    answer: Evaluation,
+    eps: float,
+    basins: list[Basin],
+    generator: torch.Generator,
+    params: MarginalParams,
+) -> Float[Tensor, "frames points 3 3"]:
+    """Of the points: the posterior, its size by refits, deformation that hides in the noise, and other answers.
+
+    Args:
+        measured, views: the observations, and what was fitted: smoothed.
+        answer: of the model, with its ``spread``.
+        basins: other answers.
+    """
+    spread, fixed = params.spread, Views(views.xy.detach(), views.visible, views.noise.detach())
+    covariance = posterior_covariance(views, model, answer, eps)
+    errors = []
+    # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
+    if spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
+        smooth = partial(smoothed, params=params.smoothing)
+        errors += [refitted(measured, smooth, model, answer, eps, generator, spread, params.descent)]
+    if spread.halves:
+        errors += [halved(fixed, model, answer, eps, generator, spread, params.descent)]
+    if errors:
+        covariance = widened(covariance, torch.cat(errors), spread.window)
+    points, rotations = answer.points[0].detach(), model.rotations[0].detach()
+    predicted = points[..., :2] + answer.translation[0].detach()[:, None]
+    lacking = unmodelled(measured.xy.detach(), measured.visible, predicted)
     others = []
-    for other, frames in basins:
-        some, part = part_of(views, model, frames)
-        points = evaluate(some, other, max(eps, params.fine)).points[0]
-        others.append((points, frames, _cost(some, other, params) - _cost(some, part, params)))
-    return others
+    with torch.no_grad():
+        for other, frames in basins:
+            some, part = part_of(fixed, model, frames)
+            excess = _cost(some, other, params) - _cost(some, part, params)
+            others.append((evaluate(some, other, max(eps, params.fine)).points[0], frames, excess))
+    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    return covariance + lacking * eye + between(points, rotations, others, spread.temper)
 
 
 def _cost(views: Views, model: ShapeModel, params: MarginalParams) -> float:
