@@ -286,7 +286,7 @@ def _covariance(
     covariance = posterior_covariance(views, model, answer, eps)
     errors = []
     # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
-    if spread.draws and float(measured.noise.detach().mean()) > (0.1 * eps) ** 2:
+    if spread.draws and float(measured.noise.detach().mean()) > (0.5 * eps) ** 2:
         smooth = partial(smoothed, params=params.smoothing)
         errors += [refitted(measured, smooth, model, answer, eps, generator, spread, params.descent)]
     if spread.halves:
