@@ -300,16 +300,6 @@ def test_every_other_film_of_real_motion_is_synthetic(generator):
     assert lengths == [[60, 40, 60, 40], [40] * 4]
 
 
-def test_sources_of_real_motion_take_turns(generator):
-    body = sample_body(generator)
-    motion = sample_motion("run", body, frames=40, generator=generator)
-    few, many = (MocapClip(motion.joints, motion.parents, motion.names, 30.0, "walk", source=name) for name in "ab")
-    short = replace(few, joints=few.joints[:30])
-    clips = {"walk": [short, many, many, many]} | {name: [] for name in MOCAP_CLASSES if name != "walk"}
-    walk = MOCAP_CLASSES.index("walk")
-    assert [len(mocap_film(6 * turn + walk, clips, 60).points3d) for turn in range(4)] == [30, 40, 30, 40]
-
-
 def test_only_clear_evidence_speaks_for_a_distractor():
     training = Training(("run", "dribble"), ReadOut(), distractor_prior=0.1)
     before = training.recogniser.to_classes.bias.detach().clone()

@@ -155,7 +155,7 @@ def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Fil
     """Film number ``seed`` of real motion on a random body; the action is ``MOCAP_CLASSES[seed % 6]``.
 
     Every other film of what the synthetic world can perform is its own: a few people show an action in a few ways. A
-    class without clips is performed by it alone. The sources of the clips take turns, however many each has.
+    class without clips is performed by it alone.
     """
     g = torch.Generator().manual_seed(seed)
     turn, label = divmod(seed, len(MOCAP_CLASSES))
@@ -163,10 +163,7 @@ def mocap_film(seed: int, clips: dict[str, list[MocapClip]], points: int) -> Fil
     of_class = clips[name]
     body = sample_body(g)
     if of_class and (name not in ACTIONS or turn % 2):
-        sources = sorted({clip.source for clip in of_class})
-        number, source = divmod(turn // (1 + (name in ACTIONS)), len(sources))
-        of_source = [clip for clip in of_class if clip.source == sources[source]]
-        clip = of_source[number % len(of_source)]
+        clip = of_class[turn // (1 + (name in ACTIONS)) % len(of_class)]
         motion = retarget_joints(clip.joints, clip.parents, clip.names, body, clip.fps)
     else:
         motion = sample_motion(name, body, generator=g)
