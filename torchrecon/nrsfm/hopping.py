@@ -68,11 +68,11 @@ class HoppingParams:
 
 
 class Basin(NamedTuple):
-    """An answer that a hop has ended at.
+    """An answer that a search has ended at.
 
     Attributes:
-        model: a batch of one, of some frames.
-        frames: (chosen,) their indices.
+        model: a batch of one, of these frames alone.
+        frames: (chosen,) indices in the sequence.
     """
 
     model: ShapeModel

@@ -230,11 +230,11 @@ def _articulated(
 ) -> tuple[tuple[ShapeModel, float, Articulation | None], list[Basin]]:
     """The answer, its residual and the pairs that keep their distance; as it was where there are none.
 
-    Second, the answers that the search has come upon, the first one among them where it was left.
-
     An exact family, whose residual went on falling, is left where it is unless it breaks its pairs, and even then where
     its modes are few: that tracks agree with few modes so closely is no accident. What is found instead has to explain
     the tracks as closely.
+
+    Second, the other answers that the search has come upon, the first one among them where it was left.
     """
     model, eps, _ = answer
     if not model.loadings.shape[-1]:
@@ -285,8 +285,7 @@ def _covariance(
     spread, fixed = params.spread, Views(views.xy.detach(), views.visible, views.noise.detach())
     covariance = posterior_covariance(views, model, answer, eps)
     errors = []
-    # Where the noise is small beside the residual, drawing it again shows nothing that the closed form has not.
-    if spread.draws and float(measured.noise.detach().mean()) > (0.5 * eps) ** 2:
+    if spread.draws and float(measured.noise.detach().mean()) > (spread.drawn * eps) ** 2:
         smooth = partial(smoothed, params=params.smoothing)
         errors += [refitted(measured, smooth, model, answer, eps, generator, spread, params.descent)]
     if spread.halves:

@@ -37,6 +37,8 @@ class SpreadParams:
 
     Attributes:
         draws: of the noise; none leaves this kind of refit out (count).
+        drawn: standard deviation of the noise over that of the residual below which none is drawn: it shows nothing
+            that the closed form has not, and would dilute what halves show (no unit).
         steps: quasi-Newton steps of a refit to drawn noise (count).
         halves: fits to one half of the tracks; none leaves them out (count).
         half_steps: quasi-Newton steps of such a fit, whose way is longer: flat valleys (count).
@@ -48,6 +50,7 @@ class SpreadParams:
     """
 
     draws: int = 4
+    drawn: float = 0.5
     steps: int = 15
     halves: int = 2
     half_steps: int = 40
